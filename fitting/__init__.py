@@ -1,0 +1,13 @@
+"""Fit control meshes of `jaxsubdiv` surfaces to scanned point clouds."""
+
+from ._correspondence import closest_points as closest_points
+from ._example import example as example
+from ._fit import Sweep as Sweep
+from ._fit import fit as fit
+from ._free import Free as Free
+from ._report import Report as Report
+from ._residuals import Priors as Priors
+from ._result import FitResult as FitResult
+from ._scan import Scan as Scan
+from ._scan import ScanError as ScanError
+from ._scan import read_scan as read_scan

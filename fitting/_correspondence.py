@@ -1,0 +1,135 @@
+"""Correspondence: for every scan point the closest point of the surface. On the host, outside of differentiation."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxsubdiv import RefinedSurface, SurfacePoint
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+
+_FIRST_CANDIDATES = 8
+_PAIRS_AT_ONCE = 2_000_000  # bounds the memory to a few hundred MB, however large scan and surface are
+_QUAD_STEPS = 3
+
+
+class _Triangles(NamedTuple):
+    """Corners of the triangulated surface."""
+
+    a: Float[np.ndarray, "t 3"]
+    b: Float[np.ndarray, "t 3"]
+    c: Float[np.ndarray, "t 3"]
+
+
+def closest_points(surface: RefinedSurface, points: Float[np.ndarray, "p 3"]) -> SurfacePoint:
+    """Closest surface point of every point: the face and where in it, not the nearest vertex.
+
+    Triangles are searched exactly: candidates come nearest centre first from a k-d tree, until no face that was not
+    looked at can be nearer. A quad is searched as its two triangles; the place found is then moved to the closest one
+    on the bilinear patch, which `js.evaluate` puts there.
+
+    Args:
+        surface: values on the host or on the device.
+        points: positions in the unit of the surface.
+    """
+    vertices = np.asarray(surface.vertices, np.float64)
+    points = np.asarray(points, np.float64)
+    corners = _Triangles(*(vertices[column] for column in np.asarray(surface.triangles()).T))
+    triangle = _nearest_triangle(corners, points)
+    _, uv = _distance_squared(_Triangles(*(corner[triangle] for corner in corners)), points)
+    face, uv = _to_faces(len(surface.faces[3]), triangle, uv)
+    in_quad = np.flatnonzero(face >= len(surface.faces[3]))
+    if len(in_quad):
+        quad = np.asarray(surface.faces[4])[face[in_quad] - len(surface.faces[3])]
+        uv[in_quad] = _polish(vertices[quad], points[in_quad], uv[in_quad])
+    return SurfacePoint(face.astype(np.int32), uv.astype(surface.vertices.dtype))
+
+
+def _nearest_triangle(corners: _Triangles, points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, "p"]:
+    n_triangles = len(corners.a)
+    centres = (corners.a + corners.b + corners.c) / 3
+    reach = max(np.sqrt(((corner - centres) ** 2).sum(axis=1).max()) for corner in corners)
+    tree = cKDTree(centres)
+    nearest = np.zeros(len(points), np.int64)
+    open_rows, k = np.arange(len(points)), min(_FIRST_CANDIDATES, n_triangles)
+    while len(open_rows):
+        unsure = []
+        for rows in np.array_split(open_rows, -(-len(open_rows) * k // _PAIRS_AT_ONCE)):
+            to_centre, candidates = tree.query(points[rows], k=np.arange(1, k + 1), workers=-1)
+            squared, _ = _distance_squared(
+                _Triangles(*(corner[candidates] for corner in corners)), points[rows][:, None]
+            )
+            best = squared.argmin(axis=1)
+            along = np.arange(len(rows))
+            nearest[rows] = candidates[along, best]
+            # A triangle lies within `reach` of its centre, so the next centre cannot belong to a nearer one.
+            unsure.append(rows[np.sqrt(squared[along, best]) + reach > to_centre[:, -1]])
+        open_rows = np.concatenate(unsure) if k < n_triangles else np.zeros(0, np.int64)
+        k = min(4 * k, n_triangles)
+    return nearest
+
+
+def _distance_squared(
+    corners: _Triangles, points: Float[np.ndarray, "*p 3"]
+) -> tuple[Float[np.ndarray, "*p"], Float[np.ndarray, "*p 2"]]:
+    """Squared distance to a triangle, and the place of the closest point: a + u (b - a) + v (c - a)."""
+    ab, ac, ap = corners.b - corners.a, corners.c - corners.a, points - corners.a
+    d00, d01, d11 = _dot(ab, ab), _dot(ab, ac), _dot(ac, ac)
+    d20, d21 = _dot(ap, ab), _dot(ap, ac)
+    area = d00 * d11 - d01 * d01
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = (d11 * d20 - d01 * d21) / area, (d00 * d21 - d01 * d20) / area
+        # Outside, the closest point lies on one of the edges ab, ac, bc; a triangle without area is its edges alone.
+        on_ab = np.nan_to_num(np.clip(d20 / d00, 0, 1))
+        on_ac = np.nan_to_num(np.clip(d21 / d11, 0, 1))
+        on_bc = np.nan_to_num(np.clip((d21 - d20 - d01 + d00) / (d00 - 2 * d01 + d11), 0, 1))
+    zero = np.zeros_like(on_ab)
+    places_u = np.stack([u, on_ab, zero, 1 - on_bc])
+    places_v = np.stack([v, zero, on_ac, on_bc])
+    squared = ((places_u[..., None] * ab + places_v[..., None] * ac - ap) ** 2).sum(axis=-1)
+    inside = (u >= 0) & (v >= 0) & (u + v <= 1)  # False where the area is zero
+    squared[0] = np.where(inside, squared[0], np.inf)
+    best = squared.argmin(axis=0)[None]
+    chosen = (np.take_along_axis(table, best, axis=0)[0] for table in (squared, places_u, places_v))
+    distance, u, v = chosen
+    return distance, np.stack([u, v], axis=-1)
+
+
+def _to_faces(
+    n_triangle_faces: int, triangle: Int[np.ndarray, "p"], uv: Float[np.ndarray, "p 2"]
+) -> tuple[Int[np.ndarray, "p"], Float[np.ndarray, "p 2"]]:
+    """From the triangulated view, where a quad is (a, b, c) and (a, c, d), to faces and their own coordinates."""
+    half = triangle - n_triangle_faces
+    in_quad, second = half >= 0, half % 2 == 1
+    u, v = uv.T
+    quad_uv = np.stack([np.where(second, u, u + v), np.where(second, u + v, v)], axis=1)
+    return np.where(in_quad, n_triangle_faces + half // 2, triangle), np.where(in_quad[:, None], quad_uv, uv)
+
+
+def _polish(
+    corners: Float[np.ndarray, "p 4 3"], points: Float[np.ndarray, "p 3"], uv: Float[np.ndarray, "p 2"]
+) -> Float[np.ndarray, "p 2"]:
+    """Gauss-Newton steps to the closest point of a bilinear patch, kept inside of it."""
+    a, b, c, d = np.moveaxis(corners, 1, 0)
+    twist = a - b + c - d
+    for _ in range(_QUAD_STEPS):
+        u, v = uv[:, :1], uv[:, 1:]
+        along_u, along_v = (b - a) + v * twist, (d - a) + u * twist
+        residual = a + u * (b - a) + v * (d - a) + u * v * twist - points
+        g0, g1 = _dot(along_u, residual), _dot(along_v, residual)
+        h00, h01, h11 = _dot(along_u, along_u), _dot(along_u, along_v), _dot(along_v, along_v)
+        # Where a side holds the point fast, the other coordinate moves alone.
+        held_u = ((uv[:, 0] <= 0) & (g0 > 0)) | ((uv[:, 0] >= 1) & (g0 < 0))
+        held_v = ((uv[:, 1] <= 0) & (g1 > 0)) | ((uv[:, 1] >= 1) & (g1 < 0))
+        h01 = np.where(held_u | held_v, 0, h01)
+        det = h00 * h11 - h01 * h01
+        safe = np.where(det > 0, det, 1)
+        step = np.stack([(h11 * g0 - h01 * g1), (h00 * g1 - h01 * g0)], axis=1) / safe[:, None]
+        step[det <= 0] = 0
+        step[held_u, 0] = 0
+        step[held_v, 1] = 0
+        uv = np.clip(uv - step, 0, 1)
+    return uv
+
+
+def _dot(a: Float[np.ndarray, "*p 3"], b: Float[np.ndarray, "*p 3"]) -> Float[np.ndarray, "*p"]:
+    return np.einsum("...x,...x->...", a, b)

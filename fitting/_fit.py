@@ -1,0 +1,190 @@
+"""`fit`: correspondence on the host and Levenberg-Marquardt on the device, in turns."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxsubdiv as js
+import lineax as lx
+import numpy as np
+import optimistix as optx
+from jaxsubdiv._linalg import unit
+from jaxsubdiv._surface import corner_weights
+from jaxtyping import Array, Float
+
+from ._correspondence import closest_points
+from ._free import Free, apply_offset, no_offset
+from ._residuals import Correspondence, Priors, Start, residuals
+from ._result import FitResult
+from ._scan import Scan, ScanError
+
+# Few steps a sweep: with points paired wrongly still, an exact solution would follow the pairing.
+_STEPS_A_SWEEP = 3
+# Inner iterations end at this relative accuracy; a tighter solve costs more than the next sweep gains.
+_LINEAR_TOLERANCE = 1e-3
+# Huber's constant: beyond 1.345 sigma of Gaussian noise, 95 % efficiency; three times that leaves honest points alone.
+_HUBER = 3 * 1.345
+_MAD_TO_SIGMA = 1.4826
+# Scans in metres against a mesh in mm differ by 1000; a partial scan of the anatomy by much less than this.
+_UNIT_RATIO = 20.0
+
+
+class Sweep(NamedTuple):
+    """What `on_sweep` is told after every sweep."""
+
+    number: int
+    rms: float
+
+
+def fit(
+    scheme: js.AbstractScheme,
+    topology: js.Topology,
+    control: js.Control,
+    scan: Scan,
+    *,
+    free: Free = Free(),  # noqa: B008  # immutable
+    priors: Priors = Priors(),  # noqa: B008  # immutable
+    max_sweeps: int = 60,
+    tolerance: float = 1e-3,
+    throw: bool = True,
+    on_sweep: Callable[[Sweep], None] | None = None,
+) -> FitResult:
+    """Fit a control mesh, its normals and h to a scan, so that the refined surface passes through the points.
+
+    Every sweep pairs each scan point with the closest point of the surface, then takes a few Levenberg-Marquardt steps
+    on the distances, most of all those across the surface, and on the priors. Points far out beyond the noise lose
+    weight (Huber, scale from the median absolute distance).
+
+    Args:
+        scheme: the scheme; its h is where the fit starts.
+        topology: tables of the control mesh, of one level or more.
+        control: where the fit starts, roughly aligned with the scan and in mm.
+        scan: the measured points in mm.
+        free: what may move.
+        priors: strengths of what is known beforehand.
+        max_sweeps: how many sweeps at most.
+        tolerance: converged once a sweep with full softness changes the RMS distance by less than this part of it.
+        throw: raise where the fit did not converge, or return the reason in `FitResult.result`.
+        on_sweep: called after every sweep, for progress.
+
+    Raises:
+        ScanError: the sizes of scan and control mesh differ as by a wrong unit, or there are too few points.
+        ValueError: the topology has no levels, or does not fit the control.
+        RuntimeError: with `throw`, the fit did not converge or met values that are not finite.
+    """
+    _check(topology, control, scan)
+    control = js.Control(control.vertices, _given_normals(topology, control))
+    points = np.asarray(scan.points)
+    given_weights = np.asarray(scan.weights_or_ones())
+
+    surface = js.refine(scheme, topology, control)
+    seen = _look(surface, points, given_weights)
+    rms, result = [seen.rms], optx.RESULTS.nonlinear_max_steps_reached
+    for sweep in range(max_sweeps):
+        fairness = priors.fairness_in(sweep)
+        pairs = _pair(surface, seen.at, scan.points, jnp.asarray(seen.weights, scan.points.dtype))
+        proposed = _sweep(free, Start(scheme, topology, control, pairs, priors, fairness))
+        if not all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(proposed)):
+            result = optx.RESULTS.nonfinite  # what the last sound sweep found is what comes back
+            break
+        scheme, control = proposed
+        surface = js.refine(scheme, topology, control)
+        seen = _look(surface, points, given_weights)
+        rms.append(seen.rms)
+        if on_sweep is not None:
+            on_sweep(Sweep(sweep + 1, seen.rms))
+        if fairness <= priors.fairness and abs(rms[-2] - rms[-1]) <= tolerance * rms[-1]:
+            result = optx.RESULTS.successful
+            break
+    found = FitResult(
+        control=control,
+        scheme=scheme,
+        surface=surface,
+        scan=scan,
+        at=seen.at,
+        distances=seen.signed,
+        weights=seen.weights,
+        rms=np.array(rms),
+        result=result,
+    )
+    if throw and result != optx.RESULTS.successful:
+        raise RuntimeError(
+            f"the fit did not converge in {len(rms) - 1} sweeps (RMS {rms[0]:.3f} -> {rms[-1]:.3f} mm): "
+            f"{optx.RESULTS[result]} Give more `max_sweeps`, a better start, or throw=False to get what there is."
+        )
+    return found
+
+
+@eqx.filter_jit
+def _sweep(free: Free, start: Start) -> tuple[js.AbstractScheme, js.Control]:
+    """A few steps of Levenberg-Marquardt at fixed correspondence; matrix-free, so that memory stays linear."""
+    solver = optx.LevenbergMarquardt(
+        rtol=1e-6, atol=1e-6, linear_solver=lx.LSMR(rtol=_LINEAR_TOLERANCE, atol=_LINEAR_TOLERANCE)
+    )
+    offset = optx.least_squares(
+        residuals,
+        solver,
+        no_offset(free, start.scheme, start.control),
+        args=start,
+        max_steps=_STEPS_A_SWEEP,
+        throw=False,
+    ).value
+    return apply_offset(start.topology, start.scheme, start.control, offset)
+
+
+class _Look(NamedTuple):
+    """The scan as seen from one surface."""
+
+    at: js.SurfacePoint
+    signed: Float[np.ndarray, "p"]
+    weights: Float[np.ndarray, "p"]
+    rms: float
+
+
+def _look(surface: js.RefinedSurface, points: Float[np.ndarray, "p 3"], given: Float[np.ndarray, "p"]) -> _Look:
+    at = closest_points(surface, points)
+    on, normals = js.evaluate(surface, at)
+    away = points - np.asarray(on)
+    distance = np.linalg.norm(away, axis=1)
+    signed = np.copysign(distance, np.einsum("px,px->p", away, np.asarray(normals)))
+    counted = given > 0
+    sigma = _MAD_TO_SIGMA * float(np.median(distance[counted]))
+    huber = np.minimum(1.0, _HUBER * sigma / np.maximum(distance, np.finfo(float).tiny))
+    return _Look(at, signed, given * huber, float(np.sqrt(np.average(distance**2, weights=given))))
+
+
+def _pair(
+    surface: js.RefinedSurface, at: js.SurfacePoint, points: Float[Array, "p 3"], weights: Float[Array, "p"]
+) -> Correspondence:
+    corners, inside = corner_weights(surface, at)
+    normals = js.evaluate(surface, at).normals
+    return Correspondence(points, corners, inside, normals, weights / jnp.mean(weights))
+
+
+def _given_normals(topology: js.Topology, control: js.Control) -> Float[Array, "v 3"]:
+    """Unit normals; from the faces where a control vertex has none: a zero normal could not turn."""
+    normals = unit(control.normals)
+    missing = jnp.all(normals == 0, axis=1, keepdims=True)
+    return jnp.where(missing, js.estimate_normals(topology.control_fans, control.vertices), normals)
+
+
+def _check(topology: js.Topology, control: js.Control, scan: Scan) -> None:
+    if not topology.levels:
+        raise ValueError("a fit needs a topology of one level or more; this one has none. Two or three serve well.")
+    n_needed = control.vertices.shape[0]
+    if scan.n_points < n_needed:
+        raise ScanError(
+            f"the scan has {scan.n_points} points for {n_needed} control vertices. Fit a coarser control mesh, or "
+            "measure more points: fewer points than vertices leave most of the surface to the priors."
+        )
+    sizes = [float(np.linalg.norm(np.ptp(np.asarray(rows), axis=0))) for rows in (scan.points, control.vertices)]
+    if sizes[0] == 0:
+        raise ScanError("all scan points lie on one spot. Check the columns of the file.")
+    ratio = sizes[0] / sizes[1]
+    if not 1 / _UNIT_RATIO <= ratio <= _UNIT_RATIO:
+        raise ScanError(
+            f"the scan measures {sizes[0]:.4g} across and the control mesh {sizes[1]:.4g}: their units differ, it "
+            "seems. Both must be in mm; read the file that is not with `scale=` (1000 for metres)."
+        )

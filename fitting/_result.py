@@ -1,0 +1,72 @@
+"""What a fit returns."""
+
+from typing import final
+
+import jaxsubdiv as js
+import numpy as np
+import optimistix as optx
+from jaxtyping import Float
+
+from ._report import Report
+from ._scan import Scan
+
+
+@final
+class FitResult:
+    """A control mesh fitted to a scan, and how well it fits.
+
+    Attributes:
+        control: fitted control vertices (mm) and unit normals.
+        scheme: the scheme with its fitted h.
+        surface: the refined surface of both.
+        scan: the scan that was fitted.
+        at: the surface point closest to every scan point.
+        distances: signed distance of every scan point from the surface in mm, positive outside.
+        weights: how much every point counted in the last sweep.
+        rms: root mean square distance of the scan points to the surface in mm: at the start, then after every sweep.
+        result: `optimistix.RESULTS.successful`, or why the fit stopped without having converged.
+    """
+
+    def __init__(
+        self,
+        *,
+        control: js.Control,
+        scheme: js.AbstractScheme,
+        surface: js.RefinedSurface,
+        scan: Scan,
+        at: js.SurfacePoint,
+        distances: Float[np.ndarray, "p"],
+        weights: Float[np.ndarray, "p"],
+        rms: Float[np.ndarray, "sweeps"],
+        result: optx.RESULTS,
+    ):
+        self.control = control
+        self.scheme = scheme
+        self.surface = surface
+        self.scan = scan
+        self.at = at
+        self.distances = distances
+        self.weights = weights
+        self.rms = rms
+        self.result = result
+
+    def report(self) -> Report:
+        """The fit in numbers: `print` it, or take `.as_dict()`."""
+        return Report(
+            converged=bool(self.result == optx.RESULTS.successful),
+            reason=str(optx.RESULTS[self.result]),
+            sweeps=len(self.rms) - 1,
+            rms_start=float(self.rms[0]),
+            rms=float(self.rms[-1]),
+            mean=float(np.mean(np.abs(self.distances))),
+            median=float(np.median(np.abs(self.distances))),
+            percentile_95=float(np.percentile(np.abs(self.distances), 95)),
+            maximum=float(np.max(np.abs(self.distances))),
+            bias=float(np.mean(self.distances)),
+            n_points=self.scan.n_points,
+            full_weight_share=float(np.mean(self.weights >= 0.999)),
+            n_control_vertices=self.control.vertices.shape[0],
+            n_faces=self.surface.n_faces,
+            h=np.asarray(self.scheme.h).tolist(),
+            rms_per_sweep=[float(value) for value in self.rms],
+        )

@@ -1,0 +1,81 @@
+"""The scan: measured points, and what is known of each."""
+
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxsubdiv as js
+import numpy as np
+from jaxsubdiv._control import strong_float
+from jaxsubdiv._errors import name_rows
+from jaxtyping import Array, Float
+
+
+class ScanError(ValueError):
+    """A scan cannot be fitted as it is; the text names the rows and what to do."""
+
+
+def _optional(value: object) -> Array | None:
+    return None if value is None else strong_float(value)
+
+
+class Scan(eqx.Module):
+    """Measured points of a surface.
+
+    Attributes:
+        points: positions in mm.
+        normals: outward normals of any length, or None.
+        weights: how much each point counts, not negative, or None where all count alike.
+
+    Raises:
+        ScanError: there is no point, a value is not finite, a weight is negative, or lengths differ.
+    """
+
+    points: Float[Array, "p 3"] = eqx.field(converter=strong_float)
+    normals: Float[Array, "p 3"] | None = eqx.field(converter=_optional, default=None)
+    weights: Float[Array, "p"] | None = eqx.field(converter=_optional, default=None)
+
+    def __check_init__(self):
+        if self.points.ndim != 2 or self.points.shape[-1] != 3 or len(self.points) == 0:
+            raise ScanError(f"a scan needs points of the shape [p, 3], at least one; got {list(self.points.shape)}.")
+        for name, values, shape in (
+            ("points", self.points, self.points.shape),
+            ("normals", self.normals, self.points.shape),
+            ("weights", self.weights, self.points.shape[:1]),
+        ):
+            if values is None:
+                continue
+            if values.shape != shape:
+                raise ScanError(f"`{name}` must have the shape {list(shape)}; got {list(values.shape)}.")
+            finite = np.isfinite(np.asarray(values)).reshape(len(values), -1).all(axis=1)
+            if not finite.all():
+                raise ScanError(f"`{name}` are not finite in rows {name_rows(np.flatnonzero(~finite))}. Drop the rows.")
+        if self.weights is not None:
+            negative = np.flatnonzero(np.asarray(self.weights) < 0)
+            if len(negative):
+                raise ScanError(f"`weights` are negative in rows {name_rows(negative)}. A point to ignore has weight 0.")
+            if not float(self.weights.sum()) > 0:
+                raise ScanError("all `weights` are 0: nothing is left to fit. Give None where all points count alike.")
+
+    @property
+    def n_points(self) -> int:
+        """Number of points."""
+        return self.points.shape[0]
+
+    def weights_or_ones(self) -> Float[Array, "p"]:
+        """The weights, 1 each where there are none."""
+        return jnp.ones_like(self.points[:, 0]) if self.weights is None else self.weights
+
+
+def read_scan(path: str | Path, *, scale: float = 1.0) -> Scan:
+    """A scan from a file of points: PLY, XYZ, CSV, TXT, NPZ, VTP, or any mesh file, whose vertices are then the points.
+
+    Args:
+        path: the file.
+        scale: multiplies the coordinates. A file of points does not say its unit; 1000 takes metres to mm.
+
+    Raises:
+        MeshError: the file cannot be read; the text names the file and the line.
+        ScanError: it holds no points.
+    """
+    return Scan(*js.read_points(path, scale=scale))

@@ -1,0 +1,25 @@
+"""Differentiable interpolating subdivision surfaces of triangles and quads, in JAX."""
+
+from importlib.metadata import version as _version
+
+from ._control import Control as Control
+from ._errors import MeshError as MeshError
+from ._io import PointCloud as PointCloud
+from ._io import read_mesh as read_mesh
+from ._io import read_points as read_points
+from ._io import write_mesh as write_mesh
+from ._mesh import ControlMesh as ControlMesh
+from ._normals import estimate_normals as estimate_normals
+from ._refine import refine as refine
+from ._scheme.base import AbstractScheme as AbstractScheme
+from ._scheme.circle_preserving import CirclePreserving as CirclePreserving
+from ._scheme.interpolating import Interpolating as Interpolating
+from ._surface import PointsAndNormals as PointsAndNormals
+from ._surface import RefinedSurface as RefinedSurface
+from ._surface import SurfacePoint as SurfacePoint
+from ._surface import evaluate as evaluate
+from ._surface import sample as sample
+from ._topology import Topology as Topology
+from ._topology import build_topology as build_topology
+
+__version__ = _version("jaxsubdiv")

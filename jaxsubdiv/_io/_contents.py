@@ -1,0 +1,71 @@
+"""What passes between the front doors and the formats: plain arrays, not yet checked as a mesh."""
+
+import importlib
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int, Shaped
+
+from .._errors import MeshError, name_rows
+
+
+class Contents(NamedTuple):
+    """The arrays of one file, in its own unit."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Mapping[int, Int[np.ndarray, "_ _"]] | None = None
+    """Polygon size (3 or 4) -> corners of the faces of that size, zero-based; None where there are points alone."""
+    normals: Float[np.ndarray, "v 3"] | None = None
+    weights: Float[np.ndarray, "v"] | None = None
+
+
+VertexData = Mapping[str, Shaped[np.ndarray, "v"]]
+"""Name -> one number a vertex."""
+
+
+def library(module: str, what: str) -> Any:
+    """Import a library of the extra `io`, or say how to get it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        root = module.partition(".")[0]
+        raise ImportError(
+            f"{what} need {root}, which cannot be imported ({error}). Install it with: pip install 'jaxsubdiv[io]'"
+        ) from error
+
+
+def warn(path: Path, text: str) -> None:
+    """Warn about what a file does to the mesh; the text starts with the file's name."""
+    warnings.warn(f"{path.name}: {text}", stacklevel=2)
+
+
+def check_polygons(path: Path, sizes: Int[np.ndarray, "f"]) -> None:
+    """Raise for faces, in the order of the file, that are neither triangles nor quads."""
+    wrong = np.flatnonzero((sizes < 3) | (sizes > 4))
+    if len(wrong):
+        raise MeshError(
+            f"{path.name}: faces {name_rows(wrong)}, counted from zero, are neither triangles nor quads (face "
+            f"{wrong[0]} has {sizes[wrong[0]]} corners). Split larger faces into triangles and quads, and drop smaller "
+            "ones."
+        )
+
+
+def whole(path: Path, values: Shaped[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
+    """Vertex indices as int64; text formats give them as floating point."""
+    with np.errstate(invalid="ignore"):  # NaN and infinity differ from any integer, and are caught below
+        indices = values.astype(np.int64)
+    if (indices != values).any():
+        raise MeshError(
+            f"{path.name}: a face uses the vertex index {values[indices != values][0]}, which is not a whole number."
+        )
+    return indices
+
+
+def by_size(
+    values: Shaped[np.ndarray, "n"], starts: Int[np.ndarray, "f"], sizes: Int[np.ndarray, "f"]
+) -> dict[int, Shaped[np.ndarray, "_ _"]]:
+    """Triangles and quads out of one run of numbers: face `i` is `values[starts[i] : starts[i] + sizes[i]]`."""
+    return {size: values[starts[sizes == size][:, None] + np.arange(size)] for size in (3, 4)}

@@ -1,0 +1,207 @@
+"""Wavefront OBJ files.
+
+Not by meshio: it loses which normal belongs to which vertex, and fails on negative indices and continued lines.
+"""
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from .._errors import MeshError, name_rows
+from ._contents import Contents, VertexData, by_size, warn
+from ._text import Rows, face_lines, number_lines, parse_rows, read_text, token_starts, tokens_per_line
+
+_CORNER = re.compile(r"[+-]?\d+(/([+-]?\d+)?(/[+-]?\d+)?)?")
+
+
+class _Lines(NamedTuple):
+    """Statements without comments, each with the line of the file on which it begins."""
+
+    text: list[str]
+    numbers: Int[np.ndarray, "l"]
+
+    def of(self, key: str) -> Int[np.ndarray, "s"]:
+        """Places of the statements that begin with `key`."""
+        return np.array([i for i, s in enumerate(self.text) if s.startswith(key + " ") or s == key], dtype=int)
+
+
+class _Corners(NamedTuple):
+    """Corners of all faces in a run, with the indices as the file has them: from one, or from the end if negative."""
+
+    vertex: Int[np.ndarray, "c"]
+    normal: Int[np.ndarray, "c"]
+    """Zero where the corner names none."""
+    sizes: Int[np.ndarray, "f"]
+    """Corners of each face."""
+
+
+def read(path: Path) -> Contents:
+    """`v`, `vn` and `f`; every other statement is left out, and so are the numbers after `v x y z`."""
+    lines = _logical_lines(read_text(path))
+    v, vn, f = lines.of("v"), lines.of("vn"), lines.of("f")
+    vertices, normals = _triples(path, lines, v, "v"), _triples(path, lines, vn, "vn")
+    if len(f) == 0:
+        return Contents(vertices, None, normals if len(normals) == len(vertices) > 0 else None)
+    corners = _corners(path, lines, f)
+    of_face = np.repeat(f, corners.sizes)  # the statement of every corner
+    named = corners.normal != 0
+    vertex = _zero_based(path, corners.vertex, v, lines, of_face, "v")
+    normal = _zero_based(path, corners.normal[named], vn, lines, of_face[named], "vn")
+    faces = by_size(vertex, np.cumsum(corners.sizes) - corners.sizes, corners.sizes)
+    return Contents(vertices, faces, _per_vertex(path, vertex, named, normal, normals, len(vertices)))
+
+
+def write(path: Path, contents: Contents, data: VertexData) -> None:
+    """`v`, `vn` where there are normals, and `f` with equal indices for both."""
+    one_based = [faces + 1 for faces in (contents.faces or {}).values()]
+    text = number_lines(contents.vertices, "v ")
+    if contents.normals is None:
+        text += face_lines(one_based, "f ")
+    else:
+        text += number_lines(contents.normals, "vn ")
+        text += "".join(f"f {' '.join(f'{i}//{i}' for i in face)}\n" for block in one_based for face in block.tolist())
+    path.write_bytes(text.encode())
+
+
+def _logical_lines(text: str) -> _Lines:
+    """Lines without comments and outer white space; a line that ends in a backslash takes in the next."""
+    lines = text.replace("\t", " ").split("\n")
+    if "#" in text:
+        lines = [line.partition("#")[0] for line in lines]
+    lines = [line.strip() for line in lines]
+    numbers = np.arange(1, len(lines) + 1)
+    if "\\" not in text:
+        return _Lines(lines, numbers)
+    joined: list[str] = []
+    begins: list[int] = []
+    continues = False
+    for number, line in zip(numbers.tolist(), lines, strict=True):
+        part = line.removesuffix("\\")
+        if continues:
+            joined[-1] += " " + part
+        else:
+            joined.append(part)
+            begins.append(number)
+        continues = line.endswith("\\")
+    return _Lines(joined, np.array(begins))
+
+
+def _triples(path: Path, lines: _Lines, at: Int[np.ndarray, "s"], key: str) -> Float[np.ndarray, "s 3"]:
+    """The first three numbers of every statement that begins with `key`."""
+    rows = _rows(path, lines, at, key)
+    if len(rows.counts) < len(at) or (rows.counts < 3).any():
+        short = next(i for i in at if len(lines.text[i].split()) < 4)
+        raise MeshError(f"{path.name}, line {lines.numbers[short]}: '{key}' must be followed by three numbers.")
+    return rows.table(3)
+
+
+def _rows(path: Path, lines: _Lines, at: Int[np.ndarray, "s"], key: str) -> Rows:
+    return parse_rows(path, "\n".join(lines.text[i][len(key) :] for i in at), lines.numbers[at])
+
+
+def _corners(path: Path, lines: _Lines, at: Int[np.ndarray, "f"]) -> _Corners:
+    """Corners of the forms a, a/b, a//c and a/b/c, in any mixture."""
+    text = "\n".join(lines.text[i][1:] for i in at).replace("//", "/0/")  # now the normal, if any, is always third
+    raw = np.frombuffer(text.encode(), np.uint8)
+    starts = token_starts(raw)
+    slashes = np.flatnonzero(raw == ord("/"))
+    parts = 1 + np.diff(np.searchsorted(slashes, np.append(starts[1:], len(raw))), prepend=0)
+    sizes = tokens_per_line(raw, starts)
+    try:
+        values = parse_rows(path, text.replace("/", " "), lines.numbers[at]).values
+    except MeshError:
+        values = np.zeros(0)
+    # An index left out, as in `1/` or `/1`, makes fewer numbers than parts, never more.
+    if len(values) != parts.sum() or (parts > 3).any() or (values % 1 != 0).any():
+        _raise_bad_corner(path, lines, at)
+    odd = (sizes < 3) | (sizes > 4)
+    if odd.any():
+        raise MeshError(
+            f"{path.name}, line {name_rows(lines.numbers[at[odd]])}: a face of {sizes[odd][0]} corners. Split larger "
+            "faces into triangles and quads, and drop smaller ones."
+        )
+    first = np.cumsum(parts) - parts
+    normal = np.where(parts == 3, values[np.minimum(first + 2, len(values) - 1)], 0)
+    return _Corners(values[first].astype(int), normal.astype(int), sizes)
+
+
+def _raise_bad_corner(path: Path, lines: _Lines, at: Int[np.ndarray, "f"]) -> None:
+    for i in at:
+        for corner in lines.text[i].split()[1:]:
+            if not _CORNER.fullmatch(corner):
+                raise MeshError(
+                    f"{path.name}, line {lines.numbers[i]}: '{corner}' is no corner of a face. Corners are written a, "
+                    "a/b, a//c or a/b/c, with whole numbers: vertex, texture coordinate, normal."
+                )
+    raise MeshError(f"{path.name}: the faces cannot be read. Corners are written a, a/b, a//c or a/b/c.")
+
+
+def _zero_based(
+    path: Path,
+    indices: Int[np.ndarray, "c"],
+    at: Int[np.ndarray, "s"],
+    lines: _Lines,
+    of_face: Int[np.ndarray, "c"],
+    key: str,
+) -> Int[np.ndarray, "c"]:
+    """Places in the list of `key` statements, which stand at `at`; a negative index counts back from its face."""
+    places = np.where(indices < 0, indices + np.searchsorted(at, of_face), indices - 1)
+    wrong = (places < 0) | (places >= len(at))
+    if wrong.any():
+        raise MeshError(
+            f"{path.name}, line {name_rows(np.unique(lines.numbers[of_face[wrong]]))}: a face uses the index "
+            f"{indices[wrong][0]} among {len(at)} '{key}' lines. Indices count from one, or from -1 backwards; correct "
+            "them or add the missing lines."
+        )
+    return places
+
+
+def _per_vertex(
+    path: Path,
+    vertex: Int[np.ndarray, "c"],
+    named: Bool[np.ndarray, "c"],
+    normal: Int[np.ndarray, "n"],
+    normals: Float[np.ndarray, "s 3"],
+    n_vertices: int,
+) -> Float[np.ndarray, "v 3"] | None:
+    """One normal a vertex out of one a corner; `normal` belongs to the corners that are `named`.
+
+    Normals that number the vertices are taken as they stand, also where no face names them.
+    """
+    if len(normals) == n_vertices and (vertex[named] == normal).all():
+        return normals
+    if len(normal) == 0:
+        if len(normals):
+            warn(path, f"no face names any of the {len(normals)} normals; they were left out.")
+        return None
+    owner, value = vertex[named], normals[normal]
+    result = np.zeros((n_vertices, 3))
+    result[owner[::-1]] = value[::-1]  # the last assignment stays, so backwards for the first
+    several = np.unique(owner[(result[owner] != value).any(axis=1)])
+    if len(several):
+        warn(
+            path,
+            f"{len(several)} vertices have several different normals ({name_rows(several)}, counted from zero); each "
+            "got their unit mean.",
+        )
+        distinct = np.unique(np.column_stack([owner, value])[np.isin(owner, several)], axis=0)
+        sums = np.zeros_like(result)
+        np.add.at(sums, distinct[:, 0].astype(int), _unit(distinct[:, 1:]))
+        result[several] = _unit(sums[several])
+    without = np.setdiff1d(vertex, owner)
+    if len(without):
+        warn(
+            path,
+            f"{len(without)} vertices have no normal while others have ({name_rows(without)}, counted from zero); they "
+            "got zero.",
+        )
+    return result
+
+
+def _unit(rows: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Rows of length one; a zero row stays."""
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    return rows / np.where(length > 0, length, 1)

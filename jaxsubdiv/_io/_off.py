@@ -1,0 +1,67 @@
+"""OFF and NOFF files.
+
+Not by meshio: it reads triangles only, and no file whose counts stand beside the word OFF.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from .._errors import MeshError
+from ._contents import Contents, VertexData, by_size, check_polygons, whole
+from ._text import face_lines, number_lines, parse_rows, read_text
+
+_HEADER = re.compile(r"(ST)?(C)?(N)?(4)?(n)?OFF\b", re.IGNORECASE)
+
+
+def read(path: Path) -> Contents:
+    """Vertices, their normals where the header says NOFF, and faces. Colours and texture coordinates are left out."""
+    text = re.sub(r"#[^\n]*", "", read_text(path))
+    header = _HEADER.match(text.lstrip())
+    if header is None:
+        raise MeshError(f"{path.name}, line 1: an OFF file begins with OFF or NOFF; this one does not.")
+    if header[4] or header[5]:
+        raise MeshError(
+            f"{path.name}, line 1: {header[0]} has vertices of more than three dimensions. Write it as OFF."
+        )
+    # Blanked and not cut, so that the lines keep their numbers.
+    rows = parse_rows(path, text.replace(header[0], "", 1))
+    if len(rows.counts) == 0 or rows.counts[0] < 2:
+        raise MeshError(f"{path.name}: after OFF the numbers of vertices, faces and edges must follow.")
+    n_vertices, n_faces = whole(path, rows.values[:2])
+    if len(rows.counts) < 1 + n_vertices + n_faces or min(n_vertices, n_faces) < 0:
+        raise MeshError(
+            f"{path.name}, line {rows.lines[0]}: {n_vertices} vertices and {n_faces} faces are announced, but "
+            f"{len(rows.counts) - 1} rows follow. The file is cut off, or its header is wrong."
+        )
+    vertices = rows.part(1, 1 + n_vertices)
+    faces = rows.part(1 + n_vertices, 1 + n_vertices + n_faces)
+    n_columns = 6 if header[3] else 3
+    short = np.flatnonzero(vertices.counts < n_columns)
+    if len(short):
+        raise MeshError(f"{path.name}, line {vertices.lines[short[0]]}: a vertex needs {n_columns} numbers.")
+    sizes = whole(path, faces.values[faces.starts])
+    short = np.flatnonzero(faces.counts < 1 + sizes)
+    if len(short):
+        raise MeshError(
+            f"{path.name}, line {faces.lines[short[0]]}: a face of {sizes[short[0]]} corners needs as many vertex "
+            "indices after that number."
+        )
+    check_polygons(path, sizes)
+    corners = by_size(faces.values, faces.starts + 1, sizes)
+    table = vertices.table(n_columns)
+    return Contents(
+        table[:, :3],
+        {size: whole(path, block) for size, block in corners.items()} if n_faces else None,
+        table[:, 3:] if header[3] else None,
+    )
+
+
+def write(path: Path, contents: Contents, data: VertexData) -> None:
+    """OFF, or NOFF where there are normals."""
+    vertices, faces, normals = contents.vertices, contents.faces or {}, contents.normals
+    rows = vertices if normals is None else np.concatenate([vertices, normals], axis=1)
+    n_faces = sum(map(len, faces.values()))
+    text = f"{'OFF' if normals is None else 'NOFF'}\n{len(vertices)} {n_faces} 0\n"
+    path.write_bytes((text + number_lines(rows) + face_lines(faces.values(), "{} ")).encode())

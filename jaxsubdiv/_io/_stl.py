@@ -1,0 +1,101 @@
+"""STL files, text and binary.
+
+Not by trimesh: of a damaged text file it returns the part before the damage without a word.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from .._errors import MeshError, name_rows
+from ._contents import Contents, VertexData, warn
+from ._text import parse_rows
+
+_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
+_HEADER = 84  # 80 bytes of anything, then the number of facets
+
+
+def read(path: Path) -> Contents:
+    """Triangles whose corners are merged where they are equal; the normals of the facets are left out.
+
+    Vertices are in the order in which the file first names them.
+    """
+    data = path.read_bytes()
+    n_facets = int.from_bytes(data[80:_HEADER], "little")
+    # Binary files may begin with "solid" too, so only their length tells.
+    if len(data) == _HEADER + n_facets * _FACET.itemsize:
+        corners = np.frombuffer(data, _FACET, offset=_HEADER)["corners"].astype(np.float64).reshape(-1, 3)
+    elif data.lstrip()[:5].lower() == b"solid":
+        corners = _text_corners(path, data.decode("utf-8", errors="replace"))
+    else:
+        raise MeshError(
+            f"{path.name}: as binary STL it should hold {n_facets} triangles in {_HEADER + 50 * n_facets} bytes, but "
+            f"it has {len(data)}; as text it should begin with 'solid'. The file is cut off or of another format."
+        )
+    vertices, indices = _merge(corners)
+    return Contents(vertices, {3: indices.reshape(-1, 3)} if len(indices) else None)
+
+
+def write(path: Path, contents: Contents, data: VertexData) -> None:
+    """Triangles, without rounding: binary where single precision holds every coordinate, otherwise text."""
+    faces = contents.faces or {}
+    triangles = faces.get(3, np.zeros((0, 3), int))
+    quads = faces.get(4, np.zeros((0, 4), int))
+    if len(quads):
+        warn(path, f"STL holds triangles only: {len(quads)} quads were split in two along their first diagonal.")
+        triangles = np.concatenate([triangles, quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    corners = contents.vertices[triangles]
+    with np.errstate(over="ignore", invalid="ignore"):
+        single = corners.astype(np.float32)
+    path.write_bytes(_binary(single) if (single == corners).all() else _text(corners).encode())
+
+
+def _text_corners(path: Path, text: str) -> Float[np.ndarray, "c 3"]:
+    lines = [line.strip() for line in text.lower().rstrip().split("\n")]
+    at = np.array([i for i, line in enumerate(lines) if line.startswith("vertex")], dtype=int)
+    rows = parse_rows(path, "\n".join(lines[i][len("vertex") :] for i in at), at + 1)
+    if len(rows.counts) < len(at) or (rows.counts != 3).any():
+        wrong = np.setdiff1d(at + 1, rows.lines[rows.counts == 3])
+        raise MeshError(f"{path.name}, line {name_rows(wrong)}: 'vertex' must be followed by three numbers.")
+    n_facets = sum(line.startswith("facet") for line in lines)
+    if len(at) != 3 * n_facets or not lines[-1].startswith("endsolid"):
+        raise MeshError(
+            f"{path.name}: {n_facets} facets with {len(at)} corners up to line {len(lines)}, where three each and a "
+            "closing 'endsolid' are expected. The file is cut off."
+        )
+    return rows.table(3)
+
+
+def _merge(corners: Float[np.ndarray, "c 3"]) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "c"]]:
+    """Equal corners as one vertex, in order of first appearance, and the vertex of every corner."""
+    order = np.lexsort(corners.T)  # stable: the first of equal corners comes first
+    ordered = corners[order]
+    is_new = np.ones(len(corners), bool)
+    is_new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    group = np.empty(len(corners), int)
+    group[order] = np.cumsum(is_new) - 1
+    first = order[is_new]
+    by_appearance = np.argsort(first)
+    place = np.empty_like(by_appearance)
+    place[by_appearance] = np.arange(len(first))
+    return corners[first[by_appearance]], place[group]
+
+
+def _binary(corners: Float[np.ndarray, "t 3 3"]) -> bytes:
+    facets = np.zeros(len(corners), _FACET)
+    facets["corners"], facets["normal"] = corners, _facet_normals(corners)
+    return b"jaxsubdiv".ljust(80) + len(facets).to_bytes(4, "little") + facets.tobytes()
+
+
+def _text(corners: Float[np.ndarray, "t 3 3"]) -> str:
+    facet = "facet normal {!r} {!r} {!r}\nouter loop\n" + 3 * "vertex {!r} {!r} {!r}\n" + "endloop\nendfacet\n"
+    rows = np.concatenate([_facet_normals(corners), corners.reshape(-1, 9)], axis=1)
+    return "solid jaxsubdiv\n" + "".join(facet.format(*row) for row in rows.tolist()) + "endsolid jaxsubdiv\n"
+
+
+def _facet_normals(corners: Float[np.ndarray, "t 3 3"]) -> Float[np.ndarray, "t 3"]:
+    corners = corners.astype(np.float64)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    return across / np.where(length > 0, length, 1)

@@ -1,0 +1,140 @@
+"""Vertex normals from the faces around a vertex, eqs. (4)-(6), and the normals of edges."""
+
+from collections.abc import Callable, Sequence
+from typing import Literal, TypeAlias
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from ._fans import Fans
+from ._linalg import Rows, cross, divide, dot, largest, take, unit, unit_or
+
+Weights: TypeAlias = Literal["area", "uniform", "angle", "sphere"]
+"""How the corner normals around a vertex are weighed in (6)."""
+Boundary: TypeAlias = Literal["fan", "chord"]
+"""Where the normal of a new boundary vertex comes from: the faces there are, or its edge."""
+
+Corners: TypeAlias = Float[Array, "k *rows 3"]
+
+# A sum of cross products that is smaller than this many rounding errors of its terms has no direction of its own.
+_ROUNDING_ERRORS = 16
+
+
+def corner_sum(
+    centre: Rows, after: Float[Array, "k *rows 3"], before: Float[Array, "k *rows 3"], weights: Weights
+) -> tuple[Rows, Float[Array, "*rows 1"]]:
+    """Weighted sum of the corner normals around a vertex, eq. (6), and the size under which it is rounding alone.
+
+    Args:
+        centre: the vertex.
+        after: its neighbour after it in each of its `k` faces, counter-clockwise around the face.
+        before: its neighbour before it in the same face.
+        weights: "area", the raw cross products as printed; "uniform", unit corner normals; "angle", unit corner normals
+            times the angle; "sphere", cross products over both squared edge lengths, exact on spheres.
+
+    Source: Sisojevs & Glazs, eqs. (4)-(6), with v_i = P_i - P; "sphere": N. Max, Weights for computing vertex normals
+    from facet normals, 1999.
+    """
+    a, b = after - centre[None], before - centre[None]
+    normals = _WEIGH[weights](cross(a, b), a, b)
+    return normals.sum(axis=0), _rounding(largest(normals).sum(axis=0))
+
+
+def ring_sum(centre: Rows, ring: Sequence[Rows], weights: Weights) -> tuple[Rows, Float[Array, "*rows 1"]]:
+    """`corner_sum` for the closed ring of a vertex's neighbours, counter-clockwise.
+
+    The centre may stand in its own ring, once or more: the faces beside it there are missing, and add nothing. With
+    area weights the sum is twice the vector area of the ring, which does not depend on the centre: two cross products
+    for six neighbours, one for four.
+    """
+    if weights != "area":
+        stacked = jnp.stack(ring)
+        return corner_sum(centre, stacked, jnp.roll(stacked, -1, axis=0), weights)
+    first, rest = ring[0], ring[1:]
+    total, terms = jnp.zeros_like(centre), jnp.zeros_like(centre[..., :1])
+    for i in range(0, len(rest) - 1, 2):  # the quads (first, rest_i, rest_i+1, rest_i+2), each by its diagonals
+        across, along = rest[i + 1] - first, rest[i + 2] - rest[i]
+        total += cross(across, along)
+        terms += largest(across) * largest(along)
+    return total, _rounding(terms)
+
+
+def estimate_normals(fans: Fans, vertices: Float[Array, "v 3"], weights: Weights = "area") -> Float[Array, "v 3"]:
+    """Unit normals at the vertices of a mesh from its faces, eqs. (4)-(6); zero where there are no faces.
+
+    Args:
+        fans: corners around every vertex; `topology.control_fans` for the control mesh.
+        vertices: positions, in any unit.
+        weights: how the corner normals are weighed, see `Interpolating`.
+
+    Differentiable in `vertices`; the gradient is 0 where the sum vanishes.
+    """
+    return fan_normals(fans, vertices, vertices, jnp.zeros_like(vertices), weights)
+
+
+def fan_normals(
+    fans: Fans,
+    centres: Float[Array, "v 3"],
+    neighbours: Float[Array, "w 3"],
+    fallback: Float[Array, "v 3"],
+    weights: Weights,
+) -> Float[Array, "v 3"]:
+    """Unit normals of `centres` by the corners in `fans`; `fallback` where the sum in (6) vanishes."""
+    parts = []
+    for fan in fans.groups:
+        after, before = take(neighbours, fan.next), take(neighbours, fan.previous)
+        total, rounding = corner_sum(take(centres, fan.centre), after, before, weights)
+        parts.append(unit_or(total, take(fallback, fan.centre), rounding))
+    return take(jnp.concatenate(parts), fans.order)
+
+
+def chord_normals(n_a: Rows, n_b: Rows, d: Rows) -> Rows:
+    """Normal of an edge, at right angles to it: the mean of its ends' normals less its part along the edge.
+
+    Source: shared by the circle-preserving scheme and the "chord" boundary: n_e = unit(s - (s.d) d / |d|^2),
+    s = n_a + n_b. Zero where `s` has nothing across the edge.
+    """
+    s = n_a + n_b
+    along = unit(d)
+    return unit_or(s - dot(s, along) * along, 0.0, _rounding(largest(s)))
+
+
+def _rounding(terms: Array) -> Array:
+    return lax.stop_gradient(_ROUNDING_ERRORS * jnp.finfo(terms.dtype).eps * terms)
+
+
+def _area(c: Corners, a: Corners, b: Corners) -> Corners:
+    return c
+
+
+def _uniform(c: Corners, a: Corners, b: Corners) -> Corners:
+    return _direction(c, a, b)
+
+
+def _angle(c: Corners, a: Corners, b: Corners) -> Corners:
+    direction = _direction(c, a, b)
+    sine, cosine = dot(c, direction), dot(a, b)
+    there = sine > 0  # atan2 has no gradient at the origin, where one edge or the angle is zero
+    return jnp.where(there, jnp.arctan2(jnp.where(there, sine, 1.0), cosine), 0.0) * direction
+
+
+def _sphere(c: Corners, a: Corners, b: Corners) -> Corners:
+    # Against the longest edge at this vertex, so that no unit enters; a vanishing edge leaves a finite weight.
+    a2, b2 = dot(a, a), dot(b, b)
+    longest = lax.stop_gradient(jnp.maximum(a2, b2).max(axis=0, keepdims=True, initial=0.0))
+    e = jnp.finfo(c.dtype).eps
+    return divide(c, longest) / ((divide(a2, longest) + e) * (divide(b2, longest) + e))
+
+
+def _direction(c: Corners, a: Corners, b: Corners) -> Corners:
+    # A fused multiply-add leaves a remainder even in the cross product of a vector with itself.
+    return unit_or(c, 0.0, _rounding(largest(a) * largest(b)))
+
+
+_WEIGH: dict[str, Callable[[Corners, Corners, Corners], Corners]] = {
+    "area": _area,
+    "uniform": _uniform,
+    "angle": _angle,
+    "sphere": _sphere,
+}
