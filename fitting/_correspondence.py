@@ -3,9 +3,11 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxsubdiv import RefinedSurface, SurfacePoint
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
+
+from jaxsubdiv import RefinedSurface, SurfacePoint
+from jaxsubdiv._half_edges import half_edges
 
 _FIRST_CANDIDATES = 8
 _PAIRS_AT_ONCE = 2_000_000  # bounds the memory to a few hundred MB, however large scan and surface are
@@ -42,6 +44,15 @@ def closest_points(surface: RefinedSurface, points: Float[np.ndarray, "p 3"]) ->
         quad = np.asarray(surface.faces[4])[face[in_quad] - len(surface.faces[3])]
         uv[in_quad] = _polish(vertices[quad], points[in_quad], uv[in_quad])
     return SurfacePoint(face.astype(np.int32), uv.astype(surface.vertices.dtype))
+
+
+def boundary_vertices(surface: RefinedSurface) -> Bool[np.ndarray, "v"]:
+    """Which vertices lie on an edge that has one face only."""
+    sides = half_edges({size: np.asarray(faces) for size, faces in surface.faces.items()})
+    faces_at_edge = np.bincount(sides.edge, minlength=len(sides.edges))
+    mask = np.zeros(len(surface.vertices), bool)
+    mask[sides.edges[faces_at_edge == 1]] = True
+    return mask
 
 
 def _nearest_triangle(corners: _Triangles, points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, "p"]:

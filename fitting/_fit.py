@@ -6,15 +6,16 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxsubdiv as js
 import lineax as lx
 import numpy as np
 import optimistix as optx
-from jaxsubdiv._linalg import unit
-from jaxsubdiv._surface import corner_weights
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from ._correspondence import closest_points
+import jaxsubdiv as js
+from jaxsubdiv._linalg import dot, norm, unit
+from jaxsubdiv._surface import corner_weights
+
+from ._correspondence import boundary_vertices, closest_points
 from ._free import Free, apply_offset, no_offset
 from ._residuals import Correspondence, Priors, Start, residuals
 from ._result import FitResult
@@ -27,6 +28,7 @@ _LINEAR_TOLERANCE = 1e-3
 # Huber's constant: beyond 1.345 sigma of Gaussian noise, 95 % efficiency; three times that leaves honest points alone.
 _HUBER = 3 * 1.345
 _MAD_TO_SIGMA = 1.4826
+_ON_BOUNDARY = 1e-3  # how far, in parts of a face, a surface point may lie from a boundary and count as on it
 # Scans in metres against a mesh in mm differ by 1000; a partial scan of the anatomy by much less than this.
 _UNIT_RATIO = 20.0
 
@@ -47,7 +49,7 @@ def fit(
     free: Free = Free(),  # noqa: B008  # immutable
     priors: Priors = Priors(),  # noqa: B008  # immutable
     max_sweeps: int = 60,
-    tolerance: float = 1e-3,
+    tolerance: float = 2e-3,
     throw: bool = True,
     on_sweep: Callable[[Sweep], None] | None = None,
 ) -> FitResult:
@@ -65,7 +67,7 @@ def fit(
         free: what may move.
         priors: strengths of what is known beforehand.
         max_sweeps: how many sweeps at most.
-        tolerance: converged once a sweep with full softness changes the RMS distance by less than this part of it.
+        tolerance: converged once a sweep with the final fairness changes the RMS distance by less than this part of it.
         throw: raise where the fit did not converge, or return the reason in `FitResult.result`.
         on_sweep: called after every sweep, for progress.
 
@@ -76,25 +78,21 @@ def fit(
     """
     _check(topology, control, scan)
     control = js.Control(control.vertices, _given_normals(topology, control))
-    points = np.asarray(scan.points)
-    given_weights = np.asarray(scan.weights_or_ones())
-
     surface = js.refine(scheme, topology, control)
-    seen = _look(surface, points, given_weights)
-    rms, result = [seen.rms], optx.RESULTS.nonlinear_max_steps_reached
+    open_vertices = boundary_vertices(surface)
+    seen = _look(surface, scan, open_vertices)
+    rms, result = [float(seen.rms)], optx.RESULTS.nonlinear_max_steps_reached
     for sweep in range(max_sweeps):
         fairness = priors.fairness_in(sweep)
-        pairs = _pair(surface, seen.at, scan.points, jnp.asarray(seen.weights, scan.points.dtype))
-        proposed = _sweep(free, Start(scheme, topology, control, pairs, priors, fairness))
-        if not all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(proposed)):
+        proposed = _sweep(free, Start(scheme, topology, control, seen.pairs, priors, fairness))
+        if not np.isfinite(proposed[-1].vertices).all():
             result = optx.RESULTS.nonfinite  # what the last sound sweep found is what comes back
             break
-        scheme, control = proposed
-        surface = js.refine(scheme, topology, control)
-        seen = _look(surface, points, given_weights)
-        rms.append(seen.rms)
+        scheme, control, surface = proposed
+        seen = _look(surface, scan, open_vertices)
+        rms.append(float(seen.rms))
         if on_sweep is not None:
-            on_sweep(Sweep(sweep + 1, seen.rms))
+            on_sweep(Sweep(sweep + 1, rms[-1]))
         if fairness <= priors.fairness and abs(rms[-2] - rms[-1]) <= tolerance * rms[-1]:
             result = optx.RESULTS.successful
             break
@@ -104,8 +102,8 @@ def fit(
         surface=surface,
         scan=scan,
         at=seen.at,
-        distances=seen.signed,
-        weights=seen.weights,
+        distances=np.asarray(seen.distances),
+        weights=np.asarray(seen.weights),
         rms=np.array(rms),
         result=result,
     )
@@ -118,7 +116,7 @@ def fit(
 
 
 @eqx.filter_jit
-def _sweep(free: Free, start: Start) -> tuple[js.AbstractScheme, js.Control]:
+def _sweep(free: Free, start: Start) -> tuple[js.AbstractScheme, js.Control, js.RefinedSurface]:
     """A few steps of Levenberg-Marquardt at fixed correspondence; matrix-free, so that memory stays linear."""
     solver = optx.LevenbergMarquardt(
         rtol=1e-6, atol=1e-6, linear_solver=lx.LSMR(rtol=_LINEAR_TOLERANCE, atol=_LINEAR_TOLERANCE)
@@ -131,36 +129,46 @@ def _sweep(free: Free, start: Start) -> tuple[js.AbstractScheme, js.Control]:
         max_steps=_STEPS_A_SWEEP,
         throw=False,
     ).value
-    return apply_offset(start.topology, start.scheme, start.control, offset)
+    scheme, control = apply_offset(start.topology, start.scheme, start.control, offset)
+    return scheme, control, js.refine(scheme, start.topology, control)
 
 
 class _Look(NamedTuple):
     """The scan as seen from one surface."""
 
     at: js.SurfacePoint
-    signed: Float[np.ndarray, "p"]
-    weights: Float[np.ndarray, "p"]
-    rms: float
+    pairs: Correspondence
+    distances: Float[Array, "p"]
+    """Signed, positive outside."""
+    weights: Float[Array, "p"]
+    rms: Float[Array, ""]
 
 
-def _look(surface: js.RefinedSurface, points: Float[np.ndarray, "p 3"], given: Float[np.ndarray, "p"]) -> _Look:
-    at = closest_points(surface, points)
+def _look(surface: js.RefinedSurface, scan: Scan, open_vertices: Bool[np.ndarray, "v"]) -> _Look:
+    return _measure(surface, scan, closest_points(surface, np.asarray(scan.points)), open_vertices)
+
+
+@jax.jit
+def _measure(
+    surface: js.RefinedSurface, scan: Scan, at: js.SurfacePoint, open_vertices: Bool[Array | np.ndarray, "v"]
+) -> _Look:
     on, normals = js.evaluate(surface, at)
-    away = points - np.asarray(on)
-    distance = np.linalg.norm(away, axis=1)
-    signed = np.copysign(distance, np.einsum("px,px->p", away, np.asarray(normals)))
-    counted = given > 0
-    sigma = _MAD_TO_SIGMA * float(np.median(distance[counted]))
-    huber = np.minimum(1.0, _HUBER * sigma / np.maximum(distance, np.finfo(float).tiny))
-    return _Look(at, signed, given * huber, float(np.sqrt(np.average(distance**2, weights=given))))
-
-
-def _pair(
-    surface: js.RefinedSurface, at: js.SurfacePoint, points: Float[Array, "p 3"], weights: Float[Array, "p"]
-) -> Correspondence:
+    away = scan.points - on
+    distance, given = norm(away)[:, 0], scan.weights_or_ones()
+    # Points without weight have no say in the scale.
+    sigma = _MAD_TO_SIGMA * jnp.nanmedian(jnp.where(given > 0, distance, jnp.nan))
+    huber = jnp.minimum(1.0, _HUBER * sigma / jnp.maximum(distance, jnp.finfo(distance.dtype).tiny))
     corners, inside = corner_weights(surface, at)
-    normals = js.evaluate(surface, at).normals
-    return Correspondence(points, corners, inside, normals, weights / jnp.mean(weights))
+    at_boundary = jnp.sum(inside * open_vertices[corners], axis=1) > 1 - _ON_BOUNDARY
+    # Beyond an open boundary a point that is far off belongs to what the control mesh does not cover.
+    weights = given * jnp.where(at_boundary & (huber < 1), 0.0, huber)
+    return _Look(
+        at=at,
+        pairs=Correspondence(scan.points, corners, inside, normals, weights / jnp.mean(weights), at_boundary),
+        distances=jnp.where(dot(normals, away)[:, 0] < 0, -distance, distance),
+        weights=weights,
+        rms=jnp.sqrt(jnp.average(distance**2, weights=given)),
+    )
 
 
 def _given_normals(topology: js.Topology, control: js.Control) -> Float[Array, "v 3"]:

@@ -2,9 +2,10 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import Array, Float
+
 import jaxsubdiv as js
 from jaxsubdiv._linalg import Rows, cross, norm, take, unit
-from jaxtyping import Array, Float
 
 
 class Free(eqx.Module):

@@ -4,13 +4,16 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
 import jaxsubdiv as js
 from jaxsubdiv._control import strong_float
-from jaxsubdiv._linalg import Rows, dot, take
+from jaxsubdiv._linalg import dot, take
 from jaxsubdiv._surface import sum_corners
-from jaxtyping import Array, Float, Int
 
 from ._free import Unknowns, apply_offset, edge_length, h_effect
+
+_DAMPING = 0.01
 
 
 class Priors(eqx.Module):
@@ -22,13 +25,13 @@ class Priors(eqx.Module):
             noise in the control mesh, a soft end follows the scan.
         h: of the displacement that h - 1 stands for, squared.
         along: of the distance along the surface, beside that across it. It holds the control vertices in their places;
-            the rest slides freely, so that the last sweeps converge fast.
+            the rest slides freely, so that the last sweeps converge fast. At an open boundary it is 1.
     """
 
     fairness: Float[Array, ""] = eqx.field(converter=strong_float, default=0.01)
     fairness_start: Float[Array, ""] = eqx.field(converter=strong_float, default=1.0)
     h: Float[Array, ""] = eqx.field(converter=strong_float, default=0.1)
-    along: Float[Array, ""] = eqx.field(converter=strong_float, default=0.01)
+    along: Float[Array, ""] = eqx.field(converter=strong_float, default=0.003)
 
     def fairness_in(self, sweep: int) -> Float[Array, ""]:
         """The weight of fairness in a sweep, counted from 0."""
@@ -46,6 +49,8 @@ class Correspondence(NamedTuple):
     """Normals of the surface there."""
     weights: Float[Array, "p"]
     """Weights of the pairs, of mean 1."""
+    at_boundary: Bool[Array, "p"]
+    """Whether the surface ends there: then the whole distance counts, for the surface may have to grow."""
 
 
 class Start(NamedTuple):
@@ -66,13 +71,17 @@ def residuals(offset: Unknowns, start: Start) -> tuple[Array, ...]:
     dtype = surface.vertices.dtype
     away = sum_corners(surface.vertices, start.pairs.corners, start.pairs.corner_weights) - start.pairs.points
     root = jnp.sqrt(start.pairs.weights)[:, None]
+    along = jnp.sqrt(jnp.where(start.pairs.at_boundary, 1.0, start.priors.along.astype(dtype)))[:, None]
     asymmetry = bend_asymmetry(start.topology, surface)
     bend = h_effect(edge_length(start.topology, start.control.vertices)) * (scheme.h.astype(dtype) - 1)
+    # optimistix starts with the damping 1, whatever the residuals: scaled by this, the mean square over the scan gives
+    # each control vertex 1 / _DAMPING on the diagonal of the normal equations.
+    scale = start.control.vertices.shape[0] / _DAMPING
     return (
-        _mean(root * dot(start.pairs.normals, away), jnp.ones((), dtype)),
-        _mean(root * away, start.priors.along.astype(dtype)),
-        *(_mean(level, start.fairness.astype(dtype)) for level in asymmetry),
-        _mean(bend, start.priors.h.astype(dtype)),
+        _mean(root * dot(start.pairs.normals, away), scale),
+        _mean(root * along * away, scale),
+        *(_mean(level, scale * start.fairness.astype(dtype)) for level in asymmetry),
+        _mean(bend[None], scale * start.priors.h.astype(dtype)),
     )
 
 
@@ -94,6 +103,6 @@ def bend_asymmetry(topology: js.Topology, surface: js.RefinedSurface) -> tuple[F
     return tuple(of(level) for level in range(min(2, len(topology.levels))))
 
 
-def _mean(rows: Array, weight: Float[Array, ""]) -> Array:
+def _mean(rows: Float[Array, "n *k"], weight: Float[Array, ""] | float) -> Float[Array, "n *k"]:
     """Rows whose squared sum is `weight` times the mean square of the rows given."""
-    return rows * jnp.sqrt(weight / max(rows.shape[0] if rows.ndim else 1, 1))
+    return rows * jnp.sqrt(weight / rows.shape[0])

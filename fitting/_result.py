@@ -2,10 +2,11 @@
 
 from typing import final
 
-import jaxsubdiv as js
 import numpy as np
 import optimistix as optx
 from jaxtyping import Float
+
+import jaxsubdiv as js
 
 from ._report import Report
 from ._scan import Scan
@@ -64,7 +65,7 @@ class FitResult:
             maximum=float(np.max(np.abs(self.distances))),
             bias=float(np.mean(self.distances)),
             n_points=self.scan.n_points,
-            full_weight_share=float(np.mean(self.weights >= 0.999)),
+            full_weight_share=float(np.mean(self.weights >= 0.999 * np.asarray(self.scan.weights_or_ones()))),
             n_control_vertices=self.control.vertices.shape[0],
             n_faces=self.surface.n_faces,
             h=np.asarray(self.scheme.h).tolist(),

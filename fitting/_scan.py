@@ -4,11 +4,12 @@ from pathlib import Path
 
 import equinox as eqx
 import jax.numpy as jnp
-import jaxsubdiv as js
 import numpy as np
+from jaxtyping import Array, Float
+
+import jaxsubdiv as js
 from jaxsubdiv._control import strong_float
 from jaxsubdiv._errors import name_rows
-from jaxtyping import Array, Float
 
 
 class ScanError(ValueError):
@@ -53,7 +54,7 @@ class Scan(eqx.Module):
         if self.weights is not None:
             negative = np.flatnonzero(np.asarray(self.weights) < 0)
             if len(negative):
-                raise ScanError(f"`weights` are negative in rows {name_rows(negative)}. A point to ignore has weight 0.")
+                raise ScanError(f"`weights` are negative in rows {name_rows(negative)}. Give 0 to ignore a point.")
             if not float(self.weights.sum()) > 0:
                 raise ScanError("all `weights` are 0: nothing is left to fit. Give None where all points count alike.")
 

@@ -47,7 +47,7 @@ class ControlMesh:
     def __init__(
         self,
         vertices: ArrayLike,
-        faces: ArrayLike | Mapping[int, ArrayLike] | Sequence[Sequence[int]],
+        faces: ArrayLike | Mapping[int, ArrayLike] | Sequence[ArrayLike],
         normals: ArrayLike | None = None,
         *,
         check: bool = True,

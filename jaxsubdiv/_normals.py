@@ -1,11 +1,13 @@
 """Vertex normals from the faces around a vertex, eqs. (4)-(6), and the normals of edges."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal, TypeAlias
 
+import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ._fans import Fans
 from ._linalg import Rows, cross, divide, dot, largest, take, unit, unit_or
@@ -21,36 +23,43 @@ Corners: TypeAlias = Float[Array, "k *rows 3"]
 _ROUNDING_ERRORS = 16
 
 
-def corner_sum(
-    centre: Rows, after: Float[Array, "k *rows 3"], before: Float[Array, "k *rows 3"], weights: Weights
-) -> tuple[Rows, Float[Array, "*rows 1"]]:
+def corner_sum(a: Corners, b: Corners, weights: Weights) -> tuple[Rows, Float[Array, "*rows 1"]]:
     """Weighted sum of the corner normals around a vertex, eq. (6), and the size under which it is rounding alone.
 
     Args:
-        centre: the vertex.
-        after: its neighbour after it in each of its `k` faces, counter-clockwise around the face.
-        before: its neighbour before it in the same face.
+        a: edges to the neighbour after the vertex in each of its `k` faces, counter-clockwise around the face.
+        b: edges to the neighbour before it in the same face.
         weights: "area", the raw cross products as printed; "uniform", unit corner normals; "angle", unit corner normals
             times the angle; "sphere", cross products over both squared edge lengths, exact on spheres.
 
     Source: Sisojevs & Glazs, eqs. (4)-(6), with v_i = P_i - P; "sphere": N. Max, Weights for computing vertex normals
     from facet normals, 1999.
     """
-    a, b = after - centre[None], before - centre[None]
     normals = _WEIGH[weights](cross(a, b), a, b)
     return normals.sum(axis=0), _rounding(largest(normals).sum(axis=0))
 
 
-def ring_sum(centre: Rows, ring: Sequence[Rows], weights: Weights) -> tuple[Rows, Float[Array, "*rows 1"]]:
+def ring_sum(
+    centre: Rows, ring: Sequence[Rows], weights: Weights, there: Bool[Array, "k *rows 1"] | None = None
+) -> tuple[Rows, Float[Array, "*rows 1"]]:
     """`corner_sum` for the closed ring of a vertex's neighbours, counter-clockwise.
 
     The centre may stand in its own ring, once or more: the faces beside it there are missing, and add nothing. With
     area weights the sum is twice the vector area of the ring, which does not depend on the centre: two cross products
     for six neighbours, one for four.
+
+    Args:
+        centre: the vertex.
+        ring: its neighbours.
+        weights: as for `corner_sum`.
+        there: whether a neighbour and the next make a corner of a face; default: all do.
     """
     if weights != "area":
-        stacked = jnp.stack(ring)
-        return corner_sum(centre, stacked, jnp.roll(stacked, -1, axis=0), weights)
+        a = jnp.stack(ring) - centre[None]
+        b = jnp.roll(a, -1, axis=0)
+        if there is not None:  # compiled code may round two copies of one position apart, and make a corner of them
+            a, b = jnp.where(there, a, 0.0), jnp.where(there, b, 0.0)
+        return corner_sum(a, b, weights)
     first, rest = ring[0], ring[1:]
     total, terms = jnp.zeros_like(centre), jnp.zeros_like(centre[..., :1])
     for i in range(0, len(rest) - 1, 2):  # the quads (first, rest_i, rest_i+1, rest_i+2), each by its diagonals
@@ -60,6 +69,7 @@ def ring_sum(centre: Rows, ring: Sequence[Rows], weights: Weights) -> tuple[Rows
     return total, _rounding(terms)
 
 
+@partial(jax.jit, static_argnames="weights")
 def estimate_normals(fans: Fans, vertices: Float[Array, "v 3"], weights: Weights = "area") -> Float[Array, "v 3"]:
     """Unit normals at the vertices of a mesh from its faces, eqs. (4)-(6); zero where there are no faces.
 
@@ -83,8 +93,9 @@ def fan_normals(
     """Unit normals of `centres` by the corners in `fans`; `fallback` where the sum in (6) vanishes."""
     parts = []
     for fan in fans.groups:
-        after, before = take(neighbours, fan.next), take(neighbours, fan.previous)
-        total, rounding = corner_sum(take(centres, fan.centre), after, before, weights)
+        centre = take(centres, fan.centre)[None]
+        a, b = take(neighbours, fan.next) - centre, take(neighbours, fan.previous) - centre
+        total, rounding = corner_sum(a, b, weights)
         parts.append(unit_or(total, take(fallback, fan.centre), rounding))
     return take(jnp.concatenate(parts), fans.order)
 

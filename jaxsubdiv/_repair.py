@@ -9,7 +9,6 @@ from itertools import combinations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 from trimesh.graph import connected_component_labels
 from trimesh.grouping import unique_rows
@@ -97,7 +96,7 @@ def _in_a_row(faces: Faces) -> Int[np.ndarray, "s"]:
     return np.concatenate([faces[3].ravel(), faces[4].ravel()])
 
 
-def _count(flags: ArrayLike, one: str, more: str | None = None) -> str:
+def _count(flags: np.ndarray | np.integer | int, one: str, more: str | None = None) -> str:
     n = int(np.sum(flags))
     return f"{n} {one if n == 1 else more or one + 's'}"
 
@@ -187,11 +186,11 @@ def _opened(work: _Work, dropped: Bool[np.ndarray, "f"]) -> str:
     left = np.bincount(sides.edge) - gone
     # A folded quad has two sides on one edge; where both go, an open edge was open before.
     opened = (left == 1) & (gone % 2 == 1)
-    return _opening(np.sum(opened))
+    return _opening(opened)
 
 
-def _opening(n_edges: int) -> str:
-    return f", which opened {_count(n_edges, 'boundary edge')}" if n_edges else ""
+def _opening(opened: np.ndarray | np.integer) -> str:
+    return f", which opened {_count(opened, 'boundary edge')}" if np.any(opened) else ""
 
 
 def _drop_repeated(work: _Work) -> None:
@@ -237,9 +236,9 @@ def _split_crowded_edges(work: _Work) -> None:
 def _copy_fans(work: _Work, fans: Int[np.ndarray, "s"], at_crowded: Bool[np.ndarray, "s"]) -> int:
     """Copy the vertex for every fan at a crowded edge but the first of the vertex; returns the number of copies.
 
-    Fans elsewhere, as those of a vertex where two cones touch, share theirs as before. A copy stands where the vertex
-    stood in the input that its first corner had then, so that what was merged by mistake is itself again; further
-    copies come last.
+    Fans elsewhere, as those of a vertex where two cones touch, share theirs as before. In the order of the vertices a
+    copy takes the place that its first corner's vertex had in the input, so that solids which only touch come back
+    as they were; further copies of one vertex come last.
     """
     _, first, fans = np.unique(fans, return_index=True, return_inverse=True)
     vertex = work.corners[first].astype(int)

@@ -1,5 +1,6 @@
 """The refined surface, and points on it: evaluate, sample."""
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -29,18 +30,21 @@ class RefinedSurface(eqx.Module):
         """Number of triangles and quads."""
         return self.faces[3].shape[0] + self.faces[4].shape[0]
 
+    @eqx.filter_jit
     def triangles(self) -> Int[Array, "s 3"]:
         """Every face as triangles: the triangles, then every quad as two, cut from its first to its third corner."""
         quads = self.faces[4]
         halves = jnp.stack([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]], axis=1)
         return jnp.concatenate([self.faces[3], halves.reshape(-1, 3)])
 
+    @eqx.filter_jit
     def areas(self) -> Float[Array, "f"]:
         """Area of every face, triangles first, in the squared unit of the vertices; a quad as its two triangles."""
         areas = self._triangle_areas()
         n = self.faces[3].shape[0]
         return jnp.concatenate([areas[:n], areas[n::2] + areas[n + 1 :: 2]])
 
+    @eqx.filter_jit
     def bounding_box(self) -> Float[Array, "2 3"]:
         """Least and greatest coordinates of the vertices that faces use."""
         used = take(self.vertices, self.triangles().reshape(-1))
@@ -84,6 +88,7 @@ def corner_weights(surface: RefinedSurface, at: SurfacePoint) -> tuple[Int[Array
     return corners, jnp.where((at.face < n_triangles)[..., None], in_triangle, in_quad)
 
 
+@jax.jit
 def evaluate(surface: RefinedSurface, at: SurfacePoint) -> PointsAndNormals:
     """Points on the surface and the normals there, differentiable in the surface and in `uv`.
 
@@ -108,6 +113,7 @@ def sum_corners(
     return (first + second) + (third + fourth)
 
 
+@partial(jax.jit, static_argnums=1)
 def sample_surface_points(surface: RefinedSurface, n: int, key: PRNGKeyArray | Array) -> SurfacePoint:
     """`n` places drawn uniformly by area; the draw has no gradient. Quads count as their two triangles."""
     areas = jax.lax.stop_gradient(surface._triangle_areas())

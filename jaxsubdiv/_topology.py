@@ -1,8 +1,8 @@
 """Topology of the refinement: integer tables, built once in numpy, that the values then run through.
 
-A level splits every triangle and every quad into four. Its new vertices are the edge vertices, one an edge, then the face
-vertices, one a quad, both numbered after the vertices that there are: a coarser level is a prefix of a finer one. Only
-the control mesh is sorted; the edges of every finer level follow from those of the coarser one by arithmetic.
+A level splits every triangle and every quad into four. Its new vertices are the edge vertices, one an edge, then the
+face vertices, one a quad, both numbered after the vertices that there are: a coarser level is a prefix of a finer one.
+Only the control mesh is sorted; the edges of every finer level follow from those of the coarser one by arithmetic.
 """
 
 import operator

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from .._errors import MeshError, name_rows
 from .._mesh import ControlMesh
 from . import _arrays, _gifti, _obj, _off, _ply, _stl, _table, _vtk
-from ._contents import Contents, VertexData
+from ._contents import Contents, VertexData, doubles
 
 __all__ = ["PointCloud", "Surface", "read_mesh", "read_points", "write_mesh"]
 
@@ -78,7 +78,7 @@ _FORMATS = {
 }
 
 
-def read_mesh(path: str | os.PathLike[str], *, scale: float = 1.0, check: bool = True) -> ControlMesh:
+def read_mesh(path: str | os.PathLike[str], *, scale: float | int = 1.0, check: bool = True) -> ControlMesh:
     """A mesh of triangles and quads from a file, with its vertex normals where it has them.
 
     Vertices, and the faces of one size, keep their order; unused vertices stay. Known suffixes, in any case:
@@ -121,7 +121,7 @@ def read_mesh(path: str | os.PathLike[str], *, scale: float = 1.0, check: bool =
         raise MeshError(f"{path.name}: {error}{mend}") from None
 
 
-def read_points(path: str | os.PathLike[str], *, scale: float = 1.0) -> PointCloud:
+def read_points(path: str | os.PathLike[str], *, scale: float | int = 1.0) -> PointCloud:
     """Points of a scan from a file, with normals and weights where it has them.
 
     Every format of `read_mesh`, whose vertices are then the points, used or not, and:
@@ -227,7 +227,7 @@ def _suffixes(able_to: str) -> str:
     return ", ".join(suffix for suffix, format_ in _FORMATS.items() if getattr(format_, able_to))
 
 
-def _check_scale(scale: float) -> None:
+def _check_scale(scale: float | int) -> None:
     if not (np.isfinite(scale) and scale > 0):
         raise ValueError(f"`scale` must be positive and finite; got {scale}. 1000 turns metres into mm.")
 
@@ -237,6 +237,11 @@ def _contents(path: Path, mesh: Surface) -> Contents:
     vertices = _numbers(path.name, "vertices", mesh.vertices, (None, 3))
     normals = None if mesh.normals is None else _numbers(path.name, "normals", mesh.normals, (len(vertices), 3))
     faces = {size: np.asarray(mesh.faces.get(size, np.zeros((0, size), int))) for size in (3, 4)}
+    if set(mesh.faces) - {3, 4} or any(
+        block.dtype.kind not in "iu" or block.shape != (len(block), size) for size, block in faces.items()
+    ):
+        raise MeshError(f"{path.name}: `faces` must be whole numbers, {{3: [t, 3], 4: [q, 4]}}; nothing is written.")
+    faces = {size: block.astype(np.int64) for size, block in faces.items()}  # small unsigned ones overflow at one-based
     corners = np.concatenate([block.ravel() for block in faces.values()])
     if len(corners) == 0 or corners.min() < 0 or corners.max() >= len(vertices):
         raise MeshError(
@@ -271,8 +276,8 @@ def _numbers(file: str, name: str, values: Any, shape: tuple[int | None, ...]) -
             f"{file}: `{name}` must be numbers of the shape [{wanted}]; got {array.dtype} of the shape "
             f"{list(array.shape)}."
         )
-    array = array.astype(np.float64)
-    bad = np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(axis=1))
+    array = doubles(array)
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
     if len(bad):
         raise MeshError(f"{file}: {name} {name_rows(bad)}, counted from zero, are not finite. Drop these rows.")
     return array

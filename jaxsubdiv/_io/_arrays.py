@@ -59,11 +59,9 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
 
 def _load(path: Path) -> dict[str, np.ndarray] | np.ndarray:
     try:
-        loaded = np.load(path, allow_pickle=False)  # a pickle may run any code
-        if isinstance(loaded, np.ndarray):
-            return loaded
-        with loaded:
-            return {name: loaded[name] for name in loaded.files}
+        with path.open("rb") as file:
+            loaded = np.load(file, allow_pickle=False)  # a pickle may run any code
+            return loaded if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
     except Exception as error:  # zipfile, zlib and numpy each raise their own
         raise MeshError(
             f"{path.name}: numpy cannot read it without unpickling ({error}). It is damaged, of another format, or "

@@ -42,6 +42,12 @@ def warn(path: Path, text: str) -> None:
     warnings.warn(f"{path.name}: {text}", stacklevel=2)
 
 
+def doubles(values: Shaped[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """A copy in float64; a NaN of any make stays one without a warning, to be named later by its row."""
+    with np.errstate(invalid="ignore"):
+        return values.astype(np.float64)
+
+
 def check_polygons(path: Path, sizes: Int[np.ndarray, "f"]) -> None:
     """Raise for faces, in the order of the file, that are neither triangles nor quads."""
     wrong = np.flatnonzero((sizes < 3) | (sizes > 4))

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from .._errors import MeshError
-from ._contents import Contents, VertexData, library, warn, whole
+from ._contents import Contents, VertexData, doubles, library, warn, whole
 
 _NORMALS = "Normals"
 
@@ -38,9 +38,9 @@ def read(path: Path) -> Contents:
             "`darrays[0].coordsys.xform` of nibabel's image where the other space is wanted.",
         )
     return Contents(
-        points[0].data.astype(np.float64),
+        doubles(points[0].data),
         {3: whole(path, triangles[0].data)} if triangles else None,
-        normals[0].data.astype(np.float64) if normals else None,
+        doubles(normals[0].data) if normals else None,
     )
 
 

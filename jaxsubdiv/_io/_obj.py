@@ -5,16 +5,17 @@ Not by meshio: it loses which normal belongs to which vertex, and fails on negat
 
 import re
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._errors import MeshError, name_rows
 from ._contents import Contents, VertexData, by_size, warn
-from ._text import Rows, face_lines, number_lines, parse_rows, read_text, token_starts, tokens_per_line
+from ._text import Rows, decode, face_lines, number_lines, parse_rows, token_starts, tokens_per_line
 
-_CORNER = re.compile(r"[+-]?\d+(/([+-]?\d+)?(/[+-]?\d+)?)?")
+_INDEX = r"[+-]?[0-9]{1,9}"  # a mesh of more vertices would not fit 32 bits
+_CORNER = re.compile(f"{_INDEX}(/{_INDEX}|/({_INDEX})?/{_INDEX})?")
 
 
 class _Lines(NamedTuple):
@@ -40,7 +41,7 @@ class _Corners(NamedTuple):
 
 def read(path: Path) -> Contents:
     """`v`, `vn` and `f`; every other statement is left out, and so are the numbers after `v x y z`."""
-    lines = _logical_lines(read_text(path))
+    lines = _logical_lines(decode(path.read_bytes()))
     v, vn, f = lines.of("v"), lines.of("vn"), lines.of("f")
     vertices, normals = _triples(path, lines, v, "v"), _triples(path, lines, vn, "vn")
     if len(f) == 0:
@@ -107,36 +108,35 @@ def _corners(path: Path, lines: _Lines, at: Int[np.ndarray, "f"]) -> _Corners:
     text = "\n".join(lines.text[i][1:] for i in at).replace("//", "/0/")  # now the normal, if any, is always third
     raw = np.frombuffer(text.encode(), np.uint8)
     starts = token_starts(raw)
-    slashes = np.flatnonzero(raw == ord("/"))
-    parts = 1 + np.diff(np.searchsorted(slashes, np.append(starts[1:], len(raw))), prepend=0)
     sizes = tokens_per_line(raw, starts)
-    try:
-        values = parse_rows(path, text.replace("/", " "), lines.numbers[at]).values
-    except MeshError:
-        values = np.zeros(0)
-    # An index left out, as in `1/` or `/1`, makes fewer numbers than parts, never more.
-    if len(values) != parts.sum() or (parts > 3).any() or (values % 1 != 0).any():
-        _raise_bad_corner(path, lines, at)
     odd = (sizes < 3) | (sizes > 4)
     if odd.any():
         raise MeshError(
             f"{path.name}, line {name_rows(lines.numbers[at[odd]])}: a face of {sizes[odd][0]} corners. Split larger "
             "faces into triangles and quads, and drop smaller ones."
         )
+    slashes = np.flatnonzero(raw == ord("/"))
+    parts = 1 + np.diff(np.searchsorted(slashes, np.append(starts[1:], len(raw))), prepend=0)
+    try:
+        values = parse_rows(path, text.replace("/", " "), lines.numbers[at]).values
+    except MeshError:
+        values = np.zeros(0)
+    # An index left out, as in `1/` or `/1`, makes fewer numbers than parts, never more.
+    are_indices = (np.abs(values) < 1e9) & (np.rint(values) == values)
+    if len(values) != parts.sum() or (parts > 3).any() or not are_indices.all():
+        _raise_bad_corner(path, lines, at)
     first = np.cumsum(parts) - parts
     normal = np.where(parts == 3, values[np.minimum(first + 2, len(values) - 1)], 0)
     return _Corners(values[first].astype(int), normal.astype(int), sizes)
 
 
-def _raise_bad_corner(path: Path, lines: _Lines, at: Int[np.ndarray, "f"]) -> None:
-    for i in at:
-        for corner in lines.text[i].split()[1:]:
-            if not _CORNER.fullmatch(corner):
-                raise MeshError(
-                    f"{path.name}, line {lines.numbers[i]}: '{corner}' is no corner of a face. Corners are written a, "
-                    "a/b, a//c or a/b/c, with whole numbers: vertex, texture coordinate, normal."
-                )
-    raise MeshError(f"{path.name}: the faces cannot be read. Corners are written a, a/b, a//c or a/b/c.")
+def _raise_bad_corner(path: Path, lines: _Lines, at: Int[np.ndarray, "f"]) -> NoReturn:
+    corners = ((i, corner.decode()) for i in at for corner in lines.text[i].encode().split()[1:])
+    i, bad = next((i, corner) for i, corner in corners if not _CORNER.fullmatch(corner))
+    raise MeshError(
+        f"{path.name}, line {lines.numbers[i]}: {bad[:40]!r} is no corner of a face. Corners are written a, a/b, a//c "
+        "or a/b/c, with whole numbers: vertex, texture coordinate, normal."
+    )
 
 
 def _zero_based(

@@ -10,18 +10,18 @@ import numpy as np
 
 from .._errors import MeshError
 from ._contents import Contents, VertexData, by_size, check_polygons, whole
-from ._text import face_lines, number_lines, parse_rows, read_text
+from ._text import decode, face_lines, number_lines, parse_rows
 
-_HEADER = re.compile(r"(ST)?(C)?(N)?(4)?(n)?OFF\b", re.IGNORECASE)
+_HEADER = re.compile(r"((ST)?(C)?(N)?(4)?(n)?OFF|off)\b")  # N: normals; n: vertices of n dimensions
 
 
 def read(path: Path) -> Contents:
     """Vertices, their normals where the header says NOFF, and faces. Colours and texture coordinates are left out."""
-    text = re.sub(r"#[^\n]*", "", read_text(path))
+    text = re.sub(r"#[^\n]*", "", decode(path.read_bytes()))
     header = _HEADER.match(text.lstrip())
     if header is None:
         raise MeshError(f"{path.name}, line 1: an OFF file begins with OFF or NOFF; this one does not.")
-    if header[4] or header[5]:
+    if header[5] or header[6]:
         raise MeshError(
             f"{path.name}, line 1: {header[0]} has vertices of more than three dimensions. Write it as OFF."
         )
@@ -29,7 +29,7 @@ def read(path: Path) -> Contents:
     rows = parse_rows(path, text.replace(header[0], "", 1))
     if len(rows.counts) == 0 or rows.counts[0] < 2:
         raise MeshError(f"{path.name}: after OFF the numbers of vertices, faces and edges must follow.")
-    n_vertices, n_faces = whole(path, rows.values[:2])
+    n_vertices, n_faces = whole(path, rows.values[:2]).tolist()
     if len(rows.counts) < 1 + n_vertices + n_faces or min(n_vertices, n_faces) < 0:
         raise MeshError(
             f"{path.name}, line {rows.lines[0]}: {n_vertices} vertices and {n_faces} faces are announced, but "
@@ -37,7 +37,7 @@ def read(path: Path) -> Contents:
         )
     vertices = rows.part(1, 1 + n_vertices)
     faces = rows.part(1 + n_vertices, 1 + n_vertices + n_faces)
-    n_columns = 6 if header[3] else 3
+    n_columns = 6 if header[4] else 3
     short = np.flatnonzero(vertices.counts < n_columns)
     if len(short):
         raise MeshError(f"{path.name}, line {vertices.lines[short[0]]}: a vertex needs {n_columns} numbers.")
@@ -54,7 +54,7 @@ def read(path: Path) -> Contents:
     return Contents(
         table[:, :3],
         {size: whole(path, block) for size, block in corners.items()} if n_faces else None,
-        table[:, 3:] if header[3] else None,
+        table[:, 3:] if header[4] else None,
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int, Shaped
 
 from .._errors import MeshError
-from ._contents import Contents, VertexData, check_polygons, whole
+from ._contents import Contents, VertexData, check_polygons, doubles, whole
 from ._text import Rows, parse_rows
 
 _TYPES = {
@@ -161,7 +161,7 @@ def _triple(columns: _Columns, names: tuple[str, str, str]) -> np.ndarray | None
     found = [columns.get(name) for name in names]
     if not all(isinstance(column, np.ndarray) for column in found):
         return None
-    return np.stack(found, axis=1).astype(np.float64)  # type: ignore[arg-type]
+    return doubles(np.stack(found, axis=1))  # type: ignore[arg-type]
 
 
 def _faces(path: Path, columns: _Columns) -> dict[int, Int[np.ndarray, "_ _"]] | None:

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._errors import MeshError, name_rows
-from ._contents import Contents, VertexData, warn
-from ._text import parse_rows
+from ._contents import Contents, VertexData, doubles, warn
+from ._text import decode, parse_rows
 
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
 _HEADER = 84  # 80 bytes of anything, then the number of facets
@@ -25,9 +25,9 @@ def read(path: Path) -> Contents:
     n_facets = int.from_bytes(data[80:_HEADER], "little")
     # Binary files may begin with "solid" too, so only their length tells.
     if len(data) == _HEADER + n_facets * _FACET.itemsize:
-        corners = np.frombuffer(data, _FACET, offset=_HEADER)["corners"].astype(np.float64).reshape(-1, 3)
+        corners = doubles(np.frombuffer(data, _FACET, offset=_HEADER)["corners"]).reshape(-1, 3)
     elif data.lstrip()[:5].lower() == b"solid":
-        corners = _text_corners(path, data.decode("utf-8", errors="replace"))
+        corners = _text_corners(path, decode(data))
     else:
         raise MeshError(
             f"{path.name}: as binary STL it should hold {n_facets} triangles in {_HEADER + 50 * n_facets} bytes, but "

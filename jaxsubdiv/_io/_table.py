@@ -3,13 +3,14 @@
 import csv
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from jaxtyping import Float
 
 from .._errors import MeshError, name_rows
 from ._contents import Contents
-from ._text import read_text
+from ._text import decode
 
 _POSITION, _NORMAL, _WEIGHT = ("x", "y", "z"), ("nx", "ny", "nz"), "weight"
 _EXPECTED = (
@@ -24,7 +25,7 @@ def read(path: Path) -> Contents:
     Commas, semicolons or white space part the columns. A header row names them in any order, and those of other names
     are left out. Without one there are 3 columns, or 6 with the normals. What follows a `#` is a comment.
     """
-    lines = enumerate(read_text(path).split("\n"), start=1)
+    lines = enumerate(decode(path.read_bytes()).split("\n"), start=1)
     rows = [(number, text) for number, line in lines if (text := line.partition("#")[0].strip())]
     if not rows:
         raise MeshError(f"{path.name}: it has no line of numbers.")
@@ -75,12 +76,11 @@ def _numbers(
         except ValueError:
             pass
     _raise_bad_row(path, rows, delimiter, places, n_columns)
-    raise AssertionError("unreachable")
 
 
 def _raise_bad_row(
     path: Path, rows: list[tuple[int, str]], delimiter: str | None, places: Sequence[int], n_columns: int
-) -> None:
+) -> NoReturn:
     for number, text in rows:
         cells = _split(text, delimiter)
         if len(cells) != n_columns:
@@ -96,7 +96,10 @@ def _raise_bad_row(
 def _split(text: str, delimiter: str | None) -> list[str]:
     if delimiter is None:
         return [cell.strip('"') for cell in text.split()]
-    return [cell.strip() for cell in next(csv.reader([text], delimiter=delimiter))]
+    try:
+        return [cell.strip() for cell in next(csv.reader([text], delimiter=delimiter))]
+    except csv.Error:  # a cell of more than 100 kB
+        return [text]
 
 
 def _is_number(cell: str) -> bool:
@@ -104,4 +107,4 @@ def _is_number(cell: str) -> bool:
         float(cell)
     except ValueError:
         return False
-    return True
+    return "_" not in cell  # Python's own way to write thousands

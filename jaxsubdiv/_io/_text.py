@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -28,9 +28,10 @@ class Rows(NamedTuple):
         return self.values[self.starts[:, None] + np.arange(n_columns)]
 
 
-def read_text(path: Path) -> str:
-    """The file as UTF-8; a byte that is not becomes a replacement character, since only comments and names hold any."""
-    return path.read_bytes().decode("utf-8", errors="replace").removeprefix("\ufeff")
+def decode(data: bytes) -> str:
+    """UTF-8 with any line ends; other bytes become replacement characters, since only comments and names have any."""
+    text = data.decode("utf-8", errors="replace").removeprefix("\ufeff")
+    return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
 
 
 def parse_rows(path: Path, text: str, lines: Int[np.ndarray, "l"] | int = 1) -> Rows:
@@ -61,9 +62,9 @@ def parse_rows(path: Path, text: str, lines: Int[np.ndarray, "l"] | int = 1) -> 
 
 def token_starts(raw: UInt8[np.ndarray, "b"]) -> Int[np.ndarray, "n"]:
     """Where each run of bytes that are not white space begins."""
-    begins = raw > 32
-    begins[1:] &= raw[:-1] <= 32
-    return np.flatnonzero(begins)
+    blank = (raw == ord(" ")) | ((raw >= ord("\t")) & (raw <= ord("\r")))
+    blank[1:] |= ~blank[:-1]  # what follows a byte of a run does not begin one
+    return np.flatnonzero(~blank)
 
 
 def tokens_per_line(raw: UInt8[np.ndarray, "b"], starts: Int[np.ndarray, "n"]) -> Int[np.ndarray, "l"]:
@@ -77,7 +78,7 @@ def number_lines(rows: Float[np.ndarray, "r c"], prefix: str = "") -> str:
     return "".join(f"{prefix}{' '.join(map(repr, row))}\n" for row in rows.tolist())
 
 
-def face_lines(faces: Iterable[Int[np.ndarray, "f k"]], prefix: str = "") -> str:
+def face_lines(faces: Iterable[Int[np.ndarray, "_ _"]], prefix: str = "") -> str:
     """One line a face; a prefix with `{}` receives the number of corners."""
     return "".join(
         f"{prefix.format(len(face))}{' '.join(map(str, face))}\n" for block in faces for face in block.tolist()
@@ -94,11 +95,10 @@ def _numbers(text: str) -> Float[np.ndarray, "n"]:
             return np.zeros(0)
 
 
-def _raise_bad_number(path: Path, text: str, lines: Int[np.ndarray, "l"]) -> None:
+def _raise_bad_number(path: Path, text: str, lines: Int[np.ndarray, "l"]) -> NoReturn:
     for line, row in zip(lines, text.split("\n"), strict=False):
-        for token in row.split():
-            try:
-                float(token)
-            except ValueError:
-                raise MeshError(f"{path.name}, line {line}: '{token[:40]}' is not a number.") from None
+        tokens = [token.decode() for token in row.encode().split()]  # of bytes: by ASCII white space, as above
+        bad = [token for token in tokens if len(_numbers(token)) != 1] if len(_numbers(row)) != len(tokens) else []
+        if bad:
+            raise MeshError(f"{path.name}, line {line}: {bad[0][:40]!r} is not a number.")
     raise MeshError(f"{path.name}: the numbers cannot be read. Write them in plain digits, such as -1.5e-3.")

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from .._errors import MeshError
-from ._contents import Contents, VertexData, by_size, check_polygons, library, warn
+from ._contents import Contents, VertexData, by_size, check_polygons, doubles, library, warn
 
 _NORMALS = "Normals"
 
@@ -23,9 +23,9 @@ def read(path: Path) -> Contents:
     names = [arrays.active_normals_name, *(name for name in arrays if name.lower() == "normals")]
     normals = [arrays[name] for name in names if name is not None and arrays[name].shape == polydata.points.shape]
     return Contents(
-        np.array(polydata.points, np.float64),
+        doubles(np.asarray(polydata.points)),
         _faces(path, polydata),
-        np.array(normals[0], np.float64) if normals else None,
+        doubles(np.asarray(normals[0])) if normals else None,
     )
 
 
@@ -82,19 +82,26 @@ def _faces(path: Path, polydata: Any) -> dict[int, np.ndarray] | None:
     polygons = polydata.GetPolys()
     if polygons.GetNumberOfCells() == 0:
         return None
-    offsets = to_numpy(polygons.GetOffsetsArray())
+    offsets, corners = (
+        to_numpy(array).astype(np.int64) for array in (polygons.GetOffsetsArray(), polygons.GetConnectivityArray())
+    )
     sizes = np.diff(offsets)
     check_polygons(path, sizes)
-    return by_size(to_numpy(polygons.GetConnectivityArray()), offsets[:-1], sizes)
+    return by_size(corners, offsets[:-1], sizes)
 
 
 def _watch(act: Any) -> tuple[Any, str]:
     """What `act` returns and what VTK says meanwhile, which would otherwise go to the terminal."""
     core = library("vtkmodules.vtkCommonCore", ".vtp and .vtk files")
-    window, before = core.vtkStringOutputWindow(), core.vtkOutputWindow.GetInstance()
+    window, window_before = core.vtkStringOutputWindow(), core.vtkOutputWindow.GetInstance()
+    logged_before = core.vtkLogger.GetCurrentVerbosityCutoff()
     core.vtkOutputWindow.SetInstance(window)
+    core.vtkLogger.SetStderrVerbosity(core.vtkLogger.VERBOSITY_OFF)
     try:
         result = act()
     finally:
-        core.vtkOutputWindow.SetInstance(before)
-    return result, " ".join(window.GetOutput().split())
+        core.vtkOutputWindow.SetInstance(window_before)
+        core.vtkLogger.SetStderrVerbosity(logged_before)
+    said = window.GetOutput()
+    text = said.decode("utf-8", errors="replace") if isinstance(said, bytes) else said  # it may quote a damaged file
+    return result, " ".join(text.split())

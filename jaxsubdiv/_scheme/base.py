@@ -107,7 +107,7 @@ def new_normals(
     wings = [take(x, column) for column in level.wings.T]
     half = len(wings) // 2
     ring = [edges.x_b, *wings[:half], edges.x_a, *wings[half:]]
-    total, rounding = ring_sum(edge_points, ring, scheme.weights)
+    total, rounding = ring_sum(edge_points, ring, scheme.weights, ring_corners(level, n_old))
     if scheme.boundary == "chord":
         chord = chord_normals(edges.n_a, edges.n_b, edges.d)
         takes_chord = is_boundary(level, n_old) & (largest(chord) > 0)
@@ -123,6 +123,16 @@ def is_boundary(level: Level, n_old: int) -> Bool[Array, "e 1"]:
     """Whether an edge has one face only: its edge vertex then stands in its own ring."""
     n_edges = level.edges.shape[0]
     return level.wings[:, -1:] == n_old + jnp.arange(n_edges, dtype=level.wings.dtype)[:, None]
+
+
+def ring_corners(level: Level, n_old: int) -> Bool[Array, "k e 1"]:
+    """Whether each neighbour of an edge vertex and the next are in one face: not where the ring stays at a quad's centre,
+    nor where it runs through the edge vertex itself, on a boundary."""
+    half = level.wings.shape[1] // 2
+    ring = jnp.stack([level.edges[:, 1], *level.wings.T[:half], level.edges[:, 0], *level.wings.T[half:]])
+    itself = n_old + jnp.arange(ring.shape[1], dtype=ring.dtype)[None]
+    after = jnp.roll(ring, -1, axis=0)
+    return ((ring != after) & (ring != itself) & (after != itself))[..., None]
 
 
 def corner_total(level: Level, values: Float[Array, "v 3"]) -> Float[Array, "q 3"]:

@@ -13,7 +13,7 @@ from .base import AbstractScheme, Edges, OldNormals, check_option, corner_total,
 Twist: TypeAlias = Literal["zero", "printed"]
 
 
-def edge_rule(h: Float[Array, ""] | Rows, x_a: Rows, x_b: Rows, n_a: Rows, n_b: Rows) -> Rows:
+def edge_rule(h: Float[Array, ""] | Float[Array, "*rows 1"], x_a: Rows, x_b: Rows, n_a: Rows, n_b: Rows) -> Rows:
     """Point in the middle of an edge, eqs. (1) and (2).
 
     With the tangents m_ab = h (d - (n_a.d) n_a) and m_ba = -h (d - (n_b.d) n_b), d = b - a, eq. (2),
@@ -52,7 +52,7 @@ class Interpolating(AbstractScheme):
         weights: of the corner normals in (6): "area" (printed), "uniform", "angle" or "sphere".
         old_normals: "keep" the normals of old vertices, which are then those of the limit; or "recompute" them by (6)
             at every level, which never folds where the given normals are bad.
-        boundary: normals of new boundary vertices by (6) on the one-sided "fan", or as the "chord" normal of their edge.
+        boundary: normals of new boundary vertices by (6) on the one-sided "fan", or the "chord" normal of their edge.
 
     Raises:
         ValueError: an option is not one of these, or `h` has more than one axis.

@@ -1,0 +1,23 @@
+"""Settings of every test: double precision, no silent promotion, shapes checked while the code runs."""
+
+from pathlib import Path
+
+import jax
+import jaxtyping
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jaxtyping.install_import_hook(["jaxsubdiv", "fitting"], "beartype.beartype")  # before anything imports them
+
+_ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of the scans and control meshes that are too large to ship; a test that needs it is skipped without."""
+    for folder in (_ROOT / "shared" / "data", _ROOT.parent / "shared" / "data"):
+        if folder.is_dir():
+            return folder
+    pytest.skip("the shared data are not beside this checkout")

@@ -1,0 +1,80 @@
+"""Every scheme and option that the properties are tested over, and what the tests of refinements share.
+
+A new scheme is one more line in `CASES`.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import pytest
+
+import jaxsubdiv as js
+from meshes import Mesh
+
+LEVELS = 2
+
+
+class Case(NamedTuple):
+    """A scheme, what `reference.refine` calls it, and the properties that it is known to lack."""
+
+    name: str
+    scheme: js.AbstractScheme
+    reference: dict[str, Any]
+    lacks: frozenset[str] = frozenset()
+
+    def with_h(self, h: Any) -> js.AbstractScheme:
+        """The same scheme with another h."""
+        options = {key: value for key, value in vars(self.scheme).items() if key != "h"}
+        return type(self.scheme)(h, **options)
+
+
+def _interpolating(twist: str, weights: str, old_normals: str, boundary: str, h: Any = 1.1) -> Case:
+    options = {"twist": twist, "weights": weights, "old_normals": old_normals, "boundary": boundary}
+    changed = [value for key, value in options.items() if value != getattr(js.Interpolating(), key)]
+    name = "-".join(changed + ["h_by_level"] * np.ndim(h)) or "default"
+    # The printed twist adds unit normals to lengths, with signs that go by the first corner.
+    lacks = frozenset({"scale", "first corner", "sphere"} if twist == "printed" else {"sphere"})
+    return Case(name, js.Interpolating(h, **options), options, lacks)
+
+
+CASES = [
+    # Every two values of two options meet in at least one of the first eight.
+    _interpolating("zero", "area", "keep", "fan"),
+    _interpolating("printed", "area", "recompute", "chord"),
+    _interpolating("zero", "uniform", "recompute", "fan"),
+    _interpolating("printed", "uniform", "keep", "chord"),
+    _interpolating("zero", "angle", "keep", "chord"),
+    _interpolating("printed", "angle", "recompute", "fan"),
+    _interpolating("zero", "sphere", "recompute", "chord"),
+    _interpolating("printed", "sphere", "keep", "fan"),
+    _interpolating("zero", "area", "keep", "fan", h=[1.2, 0.7]),
+    Case("circle", js.CirclePreserving(1.1), {"scheme": "circle"}),
+    Case("circle-h_by_level", js.CirclePreserving([1.2, 0.7]), {"scheme": "circle"}),
+]
+
+
+def over_cases(*needs: str):
+    """Run a test for every scheme that does not lack what the test needs."""
+    cases = [case for case in CASES if not case.lacks.intersection(needs)]
+    return pytest.mark.parametrize("case", cases, ids=lambda case: case.name)
+
+
+def control_mesh(mesh: Mesh) -> js.ControlMesh:
+    """A control mesh with its triangles first, as the library numbers faces."""
+    vertices, faces = mesh
+    return js.ControlMesh(vertices, sorted(faces, key=len))
+
+
+def refine_eagerly(scheme: js.AbstractScheme, topology: js.Topology, control: js.Control) -> js.RefinedSurface:
+    """`refine`, one operation after the other: for one-off sizes this costs less than compiling all of it."""
+    with jax.disable_jit():
+        return js.refine(scheme, topology, control)
+
+
+def random_control(mesh: Mesh, seed: int, bumps: float = 0.05) -> js.Control:
+    """The mesh with its vertices moved a little, and with normals of any length within about 60 degrees of its own."""
+    rng = np.random.default_rng(seed)
+    vertices = mesh[0] + rng.uniform(-bumps, bumps, mesh[0].shape)
+    own = np.asarray(js.ControlMesh(vertices, mesh[1]).control().normals)
+    return js.Control(vertices, (own + rng.uniform(-0.5, 0.5, own.shape)) * rng.uniform(0.5, 2, (len(own), 1)))
