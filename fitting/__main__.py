@@ -14,10 +14,11 @@ import optimistix as optx
 
 import jaxsubdiv as js
 from jaxsubdiv._files import replacing
+from jaxsubdiv._warnings import plain_warnings
 
 from ._example import Example, example
 from ._fit import Sweep, fit
-from ._picture import save_picture, surface_distances
+from ._picture import draw_fit, surface_distances
 from ._result import FitResult
 from ._scan import Scan, read_scan
 
@@ -35,7 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     _keep_compiled_programs()
     try:
-        return _run(options)
+        with plain_warnings():
+            return _run(options)
     except (js.MeshError, ValueError, OSError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -88,7 +90,7 @@ def _save(folder: Path, result: FitResult, start: js.ControlMesh, name: str) -> 
     written = ["control.obj", "surface.ply", "report.json"]
     try:
         with replacing(folder / "fit.png") as path:
-            save_picture(path, result, start, title=name)
+            draw_fit(result, start, title=name).savefig(path)
         written.append("fit.png")
     except ImportError as error:
         print(f"note     no picture: {error}")

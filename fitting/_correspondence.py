@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jaxsubdiv import RefinedSurface, SurfacePoint
 from jaxsubdiv._half_edges import half_edges
@@ -55,17 +55,25 @@ def boundary_vertices(surface: RefinedSurface) -> Bool[np.ndarray, "v"]:
     return mask
 
 
+def nearest_rows(
+    tree: KDTree, points: Float[np.ndarray, "p 3"], k: int
+) -> tuple[Float[np.ndarray, "p k"], Int[np.ndarray, "p k"]]:
+    """Distances and rows of the `k` points of the tree nearest to each point; the last axis stays for `k = 1` too."""
+    distances, rows = tree.query(points, k=k, workers=-1)
+    return np.reshape(distances, (len(points), k)), np.reshape(rows, (len(points), k))
+
+
 def _nearest_triangle(corners: _Triangles, points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, "p"]:
     n_triangles = len(corners.a)
     centres = (corners.a + corners.b + corners.c) / 3
     reach = max(np.sqrt(((corner - centres) ** 2).sum(axis=1).max()) for corner in corners)
-    tree = cKDTree(centres)
+    tree = KDTree(centres)
     nearest = np.zeros(len(points), np.int64)
     open_rows, k = np.arange(len(points)), min(_FIRST_CANDIDATES, n_triangles)
     while len(open_rows):
         unsure = []
         for rows in np.array_split(open_rows, -(-len(open_rows) * k // _PAIRS_AT_ONCE)):
-            to_centre, candidates = tree.query(points[rows], k=np.arange(1, k + 1), workers=-1)
+            to_centre, candidates = nearest_rows(tree, points[rows], k)
             squared, _ = _distance_squared(
                 _Triangles(*(corner[candidates] for corner in corners)), points[rows][:, None]
             )
@@ -80,8 +88,8 @@ def _nearest_triangle(corners: _Triangles, points: Float[np.ndarray, "p 3"]) -> 
 
 
 def _distance_squared(
-    corners: _Triangles, points: Float[np.ndarray, "*p 3"]
-) -> tuple[Float[np.ndarray, "*p"], Float[np.ndarray, "*p 2"]]:
+    corners: _Triangles, points: Float[np.ndarray, "*#p 3"]
+) -> tuple[Float[np.ndarray, "*#p"], Float[np.ndarray, "*#p 2"]]:
     """Squared distance to a triangle, and the place of the closest point: a + u (b - a) + v (c - a)."""
     ab, ac, ap = corners.b - corners.a, corners.c - corners.a, points - corners.a
     d00, d01, d11 = _dot(ab, ab), _dot(ab, ac), _dot(ac, ac)

@@ -19,5 +19,5 @@ def example(name: Example) -> tuple[Scan, js.ControlMesh]:
     """
     if name not in get_args(Example):
         raise ValueError(f"`name` must be one of {', '.join(map(repr, get_args(Example)))}; got {name!r}.")
-    with as_file(files(__package__) / "data" / f"{name}.npz") as path:
+    with as_file(files("fitting") / "data" / f"{name}.npz") as path:
         return read_scan(path), js.read_mesh(path)

@@ -1,5 +1,6 @@
 """`fit`: correspondence on the host and Levenberg-Marquardt on the device, in turns."""
 
+import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -29,6 +30,8 @@ _LINEAR_TOLERANCE = 1e-3
 _HUBER = 3 * 1.345
 _MAD_TO_SIGMA = 1.4826
 _ON_BOUNDARY = 1e-3  # how far, in parts of a face, a surface point may lie from a boundary and count as on it
+# A start that is off by more than this part of the control mesh's size is not roughly aligned.
+_FAR = 0.05
 # Scans in metres against a mesh in mm differ by 1000; a partial scan of the anatomy by much less than this.
 _UNIT_RATIO = 20.0
 
@@ -72,6 +75,7 @@ def fit(
         on_sweep: called after every sweep, for progress.
 
     Raises:
+        UserWarning: the start is so far off that the fit will hardly find its way.
         ScanError: the sizes of scan and control mesh differ as by a wrong unit, or there are too few points.
         ValueError: the topology has no levels, or does not fit the control.
         RuntimeError: with `throw`, the fit did not converge or met values that are not finite.
@@ -81,14 +85,16 @@ def fit(
     surface = js.refine(scheme, topology, control)
     open_vertices = boundary_vertices(surface)
     seen = _look(surface, scan, open_vertices)
+    _warn_if_far(float(seen.rms), control)
     rms, result = [float(seen.rms)], optx.RESULTS.nonlinear_max_steps_reached
     for sweep in range(max_sweeps):
         fairness = priors.fairness_in(sweep)
         proposed = _sweep(free, Start(scheme, topology, control, seen.pairs, priors, fairness))
-        if not np.isfinite(proposed[-1].vertices).all():
+        refined = js.refine(proposed[0], topology, proposed[1])
+        if not np.isfinite(refined.vertices).all():
             result = optx.RESULTS.nonfinite  # what the last sound sweep found is what comes back
             break
-        scheme, control, surface = proposed
+        (scheme, control), surface = proposed, refined
         seen = _look(surface, scan, open_vertices)
         rms.append(float(seen.rms))
         if on_sweep is not None:
@@ -116,7 +122,7 @@ def fit(
 
 
 @eqx.filter_jit
-def _sweep(free: Free, start: Start) -> tuple[js.AbstractScheme, js.Control, js.RefinedSurface]:
+def _sweep(free: Free, start: Start) -> tuple[js.AbstractScheme, js.Control]:
     """A few steps of Levenberg-Marquardt at fixed correspondence; matrix-free, so that memory stays linear."""
     solver = optx.LevenbergMarquardt(
         rtol=1e-6, atol=1e-6, linear_solver=lx.LSMR(rtol=_LINEAR_TOLERANCE, atol=_LINEAR_TOLERANCE)
@@ -129,8 +135,7 @@ def _sweep(free: Free, start: Start) -> tuple[js.AbstractScheme, js.Control, js.
         max_steps=_STEPS_A_SWEEP,
         throw=False,
     ).value
-    scheme, control = apply_offset(start.topology, start.scheme, start.control, offset)
-    return scheme, control, js.refine(scheme, start.topology, control)
+    return apply_offset(start.topology, start.scheme, start.control, offset)
 
 
 class _Look(NamedTuple):
@@ -176,6 +181,17 @@ def _given_normals(topology: js.Topology, control: js.Control) -> Float[Array, "
     normals = unit(control.normals)
     missing = jnp.all(normals == 0, axis=1, keepdims=True)
     return jnp.where(missing, js.estimate_normals(topology.control_fans, control.vertices), normals)
+
+
+def _warn_if_far(rms: float, control: js.Control) -> None:
+    size = float(np.linalg.norm(np.ptp(np.asarray(control.vertices), axis=0)))
+    if rms > _FAR * size:
+        warnings.warn(
+            f"the scan lies {rms:.3g} mm (RMS) from the surface at the start, which measures {size:.3g} mm across: "
+            "points will be paired with the wrong places. Align the control mesh with the scan first; axes named in "
+            "another order or a mirrored side are common causes.",
+            stacklevel=3,
+        )
 
 
 def _check(topology: js.Topology, control: js.Control, scan: Scan) -> None:

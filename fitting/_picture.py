@@ -1,15 +1,19 @@
 """The picture of a fit: control mesh, surface with its error, convergence. matplotlib, so that no display is needed."""
 
 from collections.abc import Mapping
-from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 import jaxsubdiv as js
 
+from ._correspondence import nearest_rows
 from ._result import FitResult
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _COLOURS = "RdBu_r"  # red where the scan lies outside of the surface, blue inside, white where they meet
 _CLAY = np.array([0.82, 0.80, 0.77])
@@ -17,25 +21,25 @@ _FROM_LIGHT = np.array([-0.35, 0.45, 0.82])  # over the viewer's left shoulder
 _NEAREST = 8
 
 
-def save_picture(path: str | PathLike[str], result: FitResult, start: js.ControlMesh, *, title: str = "") -> None:
-    """Write a picture: control mesh before and after, the surface, its distance from the scan, convergence.
+def draw_fit(result: FitResult, start: js.ControlMesh, *, title: str = "") -> "Figure":
+    """A figure of a fit: control mesh before and after, the surface, its distance from the scan, convergence.
 
     Args:
-        path: a file of a kind that matplotlib writes: `.png`, `.svg`, `.pdf`.
         result: the fit.
         start: the control mesh where the fit started.
         title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig("fit.png")`, or the last line of a notebook's cell.
 
     Raises:
         ImportError: matplotlib is missing; it comes with the extra `viz`.
     """
     try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
         raise ImportError("pictures need matplotlib: pip install 'jaxsubdiv[viz]'") from error
-    figure = Figure(figsize=(15, 9.5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(15, 9.5), layout="constrained", dpi=100)
     figure.suptitle(title, fontsize=14)
     (before, after, smooth), (error, counts, convergence) = figure.subplots(2, 3)
     view, surface = _view(result.surface), result.surface
@@ -52,7 +56,7 @@ def save_picture(path: str | PathLike[str], result: FitResult, start: js.Control
     _draw_error(error, result, view)
     _draw_counts(counts, result)
     _draw_convergence(convergence, result)
-    figure.savefig(path, dpi=100)
+    return figure
 
 
 def surface_distances(result: FitResult) -> Float[np.ndarray, "v"]:
@@ -60,12 +64,10 @@ def surface_distances(result: FitResult) -> Float[np.ndarray, "v"]:
 
     NaN farther from the scan than its points are from one another, many times over: there is nothing to tell there.
     """
-    from scipy.spatial import cKDTree
-
     points, vertices = np.asarray(result.scan.points), np.asarray(result.surface.vertices)
-    count = min(_NEAREST, len(points))
-    spacing = np.median(cKDTree(points).query(points, k=min(2, len(points)))[0][:, -1])
-    away, nearest = cKDTree(points).query(vertices, k=np.arange(1, count + 1))
+    tree = KDTree(points)
+    spacing = np.median(nearest_rows(tree, points, min(2, len(points)))[0][:, -1])
+    away, nearest = nearest_rows(tree, vertices, min(_NEAREST, len(points)))
     known = away[:, 0] <= 5 * spacing + np.abs(result.distances)[nearest[:, 0]]
     return np.where(known, result.distances[nearest].mean(axis=1), np.nan)
 

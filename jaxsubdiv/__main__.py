@@ -17,6 +17,7 @@ from ._scheme.base import AbstractScheme, OldNormals
 from ._scheme.circle_preserving import CirclePreserving
 from ._scheme.interpolating import Interpolating, Twist
 from ._topology import MAX_LEVELS, build_topology
+from ._warnings import plain_warnings
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -25,21 +26,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # A file is refined once: twice the digits cost nothing that one would notice.
     jax.config.update("jax_enable_x64", True)
     try:
-        mesh = read_mesh(options.input, scale=options.scale, check=not options.repair)
-        if options.repair:
-            mesh = mesh.repaired()
-            for sentence in mesh.repairs:
-                print(f"repaired: {sentence}")
-        print(f"read     {options.input}: {_describe(mesh)}")
-        scheme = _scheme(options)
-        topology = build_topology(mesh, scheme, options.levels, mesh_normals=options.normals_out == "mesh")
-        surface = refine(scheme, topology, _control(mesh, scheme, options.recompute_normals))
-        write_mesh(options.output, surface)
+        with plain_warnings():
+            return _run(options)
     except (MeshError, OSError, ValueError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    counts = ", ".join(f"{len(rows):,} {name}" for name, rows in zip(("triangles", "quads"), _rows(surface.faces)))
-    print(f"wrote    {options.output}: {len(surface.vertices):,} vertices, {counts}")
+
+
+def _run(options: argparse.Namespace) -> int:
+    mesh = read_mesh(options.input, scale=options.scale, check=not options.repair)
+    if options.repair:
+        mesh = mesh.repaired()
+        for sentence in mesh.repairs:
+            print(f"repaired: {sentence}")
+    print(f"read     {options.input}: {_describe(mesh)}")
+    scheme = _scheme(options)
+    topology = build_topology(mesh, scheme, options.levels, mesh_normals=options.normals_out == "mesh")
+    surface = refine(scheme, topology, _control(mesh, scheme, options.ignore_normals))
+    write_mesh(options.output, surface)
+    kinds = f"{len(surface.faces[3]):,} triangles, {len(surface.faces[4]):,} quads"
+    print(f"wrote    {options.output}: {len(surface.vertices):,} vertices, {kinds}")
     return 0
 
 
@@ -50,30 +56,38 @@ def _parser() -> argparse.ArgumentParser:
         "the faces, and the vertices of the input stay where they are.",
         epilog="Files: .obj .ply .off .stl .npz; .vtp .vtk .gii with the extra `io`. The formats differ in what they "
         "hold: .stl has no quads. Exit status: 0 done, 2 the input or the arguments cannot be used.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    parser.add_argument("input", metavar="IN", help="control mesh")
-    parser.add_argument("output", metavar="OUT", help="refined mesh; replaced only once it is complete")
-    parser.add_argument("--levels", type=int, default=3, metavar="N", help=f"how many levels, 0 to {MAX_LEVELS}")
-    parser.add_argument(
+    add = parser.add_argument
+    add("input", metavar="IN", help="control mesh")
+    add("output", metavar="OUT", help="refined mesh; an older file is replaced once the new one is complete")
+    add("--levels", type=int, default=3, metavar="N", help=f"how many levels, 0 to {MAX_LEVELS} (default: 3)")
+    add(
         "--h",
         type=float,
         nargs="+",
         default=[1.0],
         metavar="H",
-        help="tangent length coefficient: one number, or one a level; 0 is flat",
+        help="tangent length coefficient, one number or one a level; 0 is flat (default: 1)",
     )
-    parser.add_argument("--scheme", choices=("interpolating", "circle"), default="interpolating", help="the rules")
-    parser.add_argument("--twist", choices=get_args(Twist), help="quad centres; only 'zero' is free of the unit")
-    parser.add_argument("--weights", choices=get_args(Weights), help="weights of face normals at a vertex")
-    parser.add_argument("--old-normals", choices=get_args(OldNormals), help="normals of old vertices at later levels")
-    parser.add_argument("--boundary", choices=get_args(Boundary), help="normals of new boundary vertices")
-    parser.add_argument("--recompute-normals", action="store_true", help="put the normals in the file aside")
-    parser.add_argument(
-        "--normals-out", choices=("scheme", "mesh"), default="scheme", help="the scheme's normals, or those of the mesh"
+    add(
+        "--scheme",
+        choices=("interpolating", "circle"),
+        default="interpolating",
+        help="the paper's rules, or rules that reproduce circles (default: interpolating)",
     )
-    parser.add_argument("--scale", type=float, default=1.0, help="multiplies the coordinates; 1000 for metres to mm")
-    parser.add_argument("--repair", action="store_true", help="mend what can be mended first, and say what was done")
+    add("--twist", choices=get_args(Twist), help="of quad centres; only 'zero' is free of the unit (default: zero)")
+    add("--weights", choices=get_args(Weights), help="of the face normals around a vertex (default: area)")
+    add("--old-normals", choices=get_args(OldNormals), help="what later levels do with them (default: keep)")
+    add("--boundary", choices=get_args(Boundary), help="normals of new boundary vertices (default: fan)")
+    add("--ignore-normals", action="store_true", help="compute control normals from the faces, whatever the file has")
+    add(
+        "--normals-out",
+        choices=("scheme", "mesh"),
+        default="scheme",
+        help="the scheme's own normals, or those of the refined mesh (default: scheme)",
+    )
+    add("--scale", type=float, default=1.0, help="multiplies the coordinates; 1000 for metres to mm (default: 1)")
+    add("--repair", action="store_true", help="mend first what can be mended, and say what was done")
     return parser
 
 
@@ -89,14 +103,10 @@ def _scheme(options: argparse.Namespace) -> AbstractScheme:
     return CirclePreserving(h)
 
 
-def _control(mesh: ControlMesh, scheme: AbstractScheme, recompute: bool) -> Control:
-    if recompute:
+def _control(mesh: ControlMesh, scheme: AbstractScheme, ignore_normals: bool) -> Control:
+    if ignore_normals:
         mesh = ControlMesh(mesh.vertices, mesh.faces)
     return mesh.control(weights=scheme.weights)
-
-
-def _rows(faces: dict) -> tuple:
-    return faces[3], faces[4]
 
 
 def _describe(mesh: ControlMesh) -> str:

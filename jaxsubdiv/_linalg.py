@@ -63,9 +63,3 @@ def unit(v: Rows) -> Rows:
 def norm(v: Rows) -> Float[Array, "*rows 1"]:
     """Length of every row; the gradient at a zero row is 0."""
     return dot(v, unit(v))
-
-
-def divide(a: Float[Array, "*#rows _"], b: Float[Array, "*#rows 1"]) -> Float[Array, "*#rows _"]:
-    """`a / b` row by row; 0, with gradient 0, where `b` is 0."""
-    there = b != 0
-    return jnp.where(there, a / jnp.where(there, b, 1.0), 0.0)

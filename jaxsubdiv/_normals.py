@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ._fans import Fans
-from ._linalg import Rows, cross, divide, dot, largest, take, unit, unit_or
+from ._linalg import Rows, cross, dot, largest, take, unit, unit_or
 
 Weights: TypeAlias = Literal["area", "uniform", "angle", "sphere"]
 """How the corner normals around a vertex are weighed in (6)."""
@@ -131,11 +131,14 @@ def _angle(c: Corners, a: Corners, b: Corners) -> Corners:
 
 
 def _sphere(c: Corners, a: Corners, b: Corners) -> Corners:
-    # Against the longest edge at this vertex, so that no unit enters; a vanishing edge leaves a finite weight.
+    # Against the longest edge at this vertex, so that no unit enters; a short edge leaves a finite weight. An edge that
+    # is rounding alone drops its corners: the weight there has a gradient of 1 / e, which says nothing.
     a2, b2 = dot(a, a), dot(b, b)
     longest = lax.stop_gradient(jnp.maximum(a2, b2).max(axis=0, keepdims=True, initial=0.0))
     e = jnp.finfo(c.dtype).eps
-    return divide(c, longest) / ((divide(a2, longest) + e) * (divide(b2, longest) + e))
+    there = lax.stop_gradient(jnp.minimum(a2, b2)) > (_ROUNDING_ERRORS * e) ** 2 * longest
+    c, a2, b2 = (jnp.where(there, rows, 1.0) / jnp.where(there, longest, 1.0) for rows in (c, a2, b2))
+    return jnp.where(there, c / ((a2 + e) * (b2 + e)), 0.0)
 
 
 def _direction(c: Corners, a: Corners, b: Corners) -> Corners:

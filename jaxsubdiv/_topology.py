@@ -131,20 +131,25 @@ class _Stage(NamedTuple):
 
 def _first_stage(mesh: ControlMesh) -> _Stage:
     sides = mesh.half_edges
-    n_edges, numbers = len(sides.edges), np.arange(len(sides.start))
+    n_edges, numbers = len(sides.edges), _numbers(len(sides.start))
     forward = sides.start < sides.end
-    left, right = np.full(n_edges, -1), np.full(n_edges, -1)
+    left, right = np.full((2, n_edges), -1, np.int32)
     left[sides.edge[forward]] = numbers[forward]
     right[sides.edge[~forward]] = numbers[~forward]
     turned = left < 0  # a boundary edge whose only face runs against it: take it the other way round
     left, right = np.where(turned, right, left), np.where(turned, left, right)
-    edges = np.where(turned[:, None], sides.edges[:, ::-1], sides.edges)
+    edges = np.where(turned[:, None], sides.edges[:, ::-1], sides.edges).astype(np.int32)
     n_triangle_sides = 3 * len(mesh.faces[3])
     face_edges = {
-        3: sides.edge[:n_triangle_sides].reshape(-1, 3),
-        4: sides.edge[n_triangle_sides:].reshape(-1, 4),
+        3: sides.edge[:n_triangle_sides].reshape(-1, 3).astype(np.int32),
+        4: sides.edge[n_triangle_sides:].reshape(-1, 4).astype(np.int32),
     }
     return _Stage(len(mesh.vertices), mesh.faces, face_edges, edges, left, right)
+
+
+def _numbers(n: int) -> Int[np.ndarray, "n"]:
+    """0 to n - 1 in 32 bits: the tables are bound by memory, and twice as fast to build so."""
+    return np.arange(n, dtype=np.int32)
 
 
 def _level(stage: _Stage, recompute: bool) -> Level:
@@ -161,14 +166,14 @@ def _wings(stage: _Stage) -> Int[np.ndarray, "e w"]:
     """Other neighbours of every edge vertex: the next edge vertices in a triangle, the centre of a quad."""
     n, n_edges = stage.n_vertices, len(stage.edges)
     n_quads = len(stage.faces[4])
-    centres = np.repeat(n + n_edges + np.arange(n_quads), 4)
+    centres = np.repeat(n + n_edges + _numbers(n_quads), 4)
     width = 2 if len(stage.faces[3]) else 1
     sides = []
     for ahead in range(1, width + 1):
         in_triangle = n + np.roll(stage.face_edges[3], -ahead, axis=1).ravel()
         sides.append(np.concatenate([in_triangle, centres]))
     beside = np.stack(sides, axis=1)
-    itself = (n + np.arange(n_edges))[:, None]
+    itself = (n + _numbers(n_edges))[:, None]
     right = np.where(stage.right[:, None] < 0, itself, beside[stage.right])
     return np.concatenate([beside[stage.left], right], axis=1)
 
@@ -187,7 +192,7 @@ def _split(stage: _Stage) -> _Stage:
 
     def inner(size: int) -> Int[np.ndarray, "_ _"]:
         count = len(stage.faces[size])
-        return (2 * n_edges + (3 * n_triangles if size == 4 else 0) + np.arange(size * count)).reshape(count, size)
+        return (2 * n_edges + (3 * n_triangles if size == 4 else 0) + _numbers(size * count)).reshape(count, size)
 
     def back(table: Int[np.ndarray, "_ _"]) -> Int[np.ndarray, "_ _"]:
         return np.roll(table, 1, axis=1)
@@ -199,7 +204,7 @@ def _split(stage: _Stage) -> _Stage:
         return 2 * edge + runs_back, 2 * edge + ~runs_back
 
     q3, q4 = n + stage.face_edges[3], n + stage.face_edges[4]
-    centre = np.broadcast_to((n + n_edges + np.arange(n_quads))[:, None], (n_quads, 4))
+    centre = np.broadcast_to((n + n_edges + _numbers(n_quads))[:, None], (n_quads, 4))
     (near3, far3), (near4, far4) = halves(3), halves(4)
     inner3, inner4 = inner(3), inner(4)
 
@@ -216,14 +221,14 @@ def _split(stage: _Stage) -> _Stage:
     }
 
     # The sides of the children, by corner of the parent: child `c` and which of its own sides.
-    child3 = 4 * np.arange(n_triangles)[:, None] + np.arange(3)
-    child4 = 4 * np.arange(n_quads)[:, None] + np.arange(4)
-    middle_side = 3 * (4 * np.arange(n_triangles)[:, None] + 3) + np.arange(3)
+    child3 = 4 * _numbers(n_triangles)[:, None] + _numbers(3)
+    child4 = 4 * _numbers(n_quads)[:, None] + _numbers(4)
+    middle_side = 3 * (4 * _numbers(n_triangles)[:, None] + 3) + _numbers(3)
     starts = np.concatenate([(3 * child3).ravel(), (first_quad_side + 4 * child4).ravel()])
     ends = np.concatenate(
         [(3 * np.roll(child3, -1, 1) + 2).ravel(), (first_quad_side + 4 * np.roll(child4, -1, 1) + 3).ravel()]
     )
-    middle = n + np.arange(n_edges)
+    middle = n + _numbers(n_edges)
     no_right = stage.right < 0
     right_start, right_end = (np.where(no_right, -1, sides[stage.right]) for sides in (starts, ends))
     return _Stage(

@@ -3,6 +3,7 @@
 A new scheme is one more line in `CASES`.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -25,8 +26,7 @@ class Case(NamedTuple):
 
     def with_h(self, h: Any) -> js.AbstractScheme:
         """The same scheme with another h."""
-        options = {key: value for key, value in vars(self.scheme).items() if key != "h"}
-        return type(self.scheme)(h, **options)
+        return dataclasses.replace(self.scheme, h=h)
 
 
 def _interpolating(twist: str, weights: str, old_normals: str, boundary: str, h: Any = 1.1) -> Case:

@@ -6,8 +6,6 @@ the formats that need them, when they need them.
 
 import errno
 import os
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -17,6 +15,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from .._errors import MeshError, name_rows
+from .._files import replacing
 from .._mesh import ControlMesh
 from . import _arrays, _gifti, _obj, _off, _ply, _stl, _table, _vtk
 from ._contents import Contents, VertexData, doubles
@@ -177,7 +176,7 @@ def write_mesh(
             hold it or the vertex data.
         ImportError: the format needs a library of the extra `io` which is not installed.
     """
-    path = Path(path).resolve()  # so that a link stays one, and the file behind it is replaced
+    path = Path(path)
     if path.is_dir():
         raise MeshError(f"{path}: this is a folder. Name a file in it.")
     format_ = _format(path)
@@ -191,13 +190,8 @@ def write_mesh(
     data = _vertex_data(vertex_data or {}, len(contents.vertices))
     if data and not format_.holds_data:
         raise MeshError(f"{path.name}: {path.suffix} files hold no vertex data. Write {_suffixes('holds_data')}.")
-    # A folder beside the file, so on the same disk, in which the file has its own name: messages give that.
-    with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
-        unfinished = Path(folder) / path.name
+    with replacing(path) as unfinished:
         format_.write(unfinished, contents, data)
-        if path.exists():
-            shutil.copymode(path, unfinished)
-        os.replace(unfinished, path)
 
 
 def _open(path: str | os.PathLike[str]) -> tuple[Path, _Format]:

@@ -57,21 +57,15 @@ class AbstractScheme(eqx.Module):
     """
 
     h: eqx.AbstractVar[Float[Array, "..."]]
+    weights: eqx.AbstractVar[Weights]
+    """How corner normals are weighed in (6)."""
+    boundary: eqx.AbstractVar[Boundary]
+    """Where the normal of a new boundary vertex comes from."""
 
     @property
     @abstractmethod
     def recomputes_normals(self) -> bool:
         """Whether old vertices get new normals at every level."""
-
-    @property
-    @abstractmethod
-    def weights(self) -> Weights:
-        """How corner normals are weighed in (6)."""
-
-    @property
-    @abstractmethod
-    def boundary(self) -> Boundary:
-        """Where the normal of a new boundary vertex comes from."""
 
     @abstractmethod
     def edge_points(self, h: Float[Array, ""], edges: Edges) -> Float[Array, "e 3"]:
@@ -126,8 +120,10 @@ def is_boundary(level: Level, n_old: int) -> Bool[Array, "e 1"]:
 
 
 def ring_corners(level: Level, n_old: int) -> Bool[Array, "k e 1"]:
-    """Whether each neighbour of an edge vertex and the next are in one face: not where the ring stays at a quad's centre,
-    nor where it runs through the edge vertex itself, on a boundary."""
+    """Whether each neighbour of an edge vertex and the next are in one face.
+
+    They are not where the ring stays at a quad's centre, nor where, on a boundary, it runs through the edge vertex.
+    """
     half = level.wings.shape[1] // 2
     ring = jnp.stack([level.edges[:, 1], *level.wings.T[:half], level.edges[:, 0], *level.wings.T[half:]])
     itself = n_old + jnp.arange(ring.shape[1], dtype=ring.dtype)[None]

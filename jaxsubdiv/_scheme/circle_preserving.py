@@ -46,18 +46,12 @@ class CirclePreserving(AbstractScheme):
     """
 
     h: Float[Array, "..."] = eqx.field(converter=tangent_length, default=1.0)
+    weights: Weights = eqx.field(static=True, default="sphere", init=False)
+    boundary: Boundary = eqx.field(static=True, default="chord", init=False)
 
     @property
     def recomputes_normals(self) -> bool:
         return False
-
-    @property
-    def weights(self) -> Weights:
-        return "sphere"
-
-    @property
-    def boundary(self) -> Boundary:
-        return "chord"
 
     def edge_points(self, h: Float[Array, ""], edges: Edges) -> Float[Array, "e 3"]:
         return arc_rule(h, *edges)
