@@ -164,7 +164,7 @@ def _measure(
     sigma = _MAD_TO_SIGMA * jnp.nanmedian(jnp.where(given > 0, distance, jnp.nan))
     huber = jnp.minimum(1.0, _HUBER * sigma / jnp.maximum(distance, jnp.finfo(distance.dtype).tiny))
     corners, inside = corner_weights(surface, at)
-    at_boundary = jnp.sum(inside * open_vertices[corners], axis=1) > 1 - _ON_BOUNDARY
+    at_boundary = jnp.sum(jnp.where(open_vertices[corners], inside, 0.0), axis=1) > 1 - _ON_BOUNDARY
     # Beyond an open boundary a point that is far off belongs to what the control mesh does not cover.
     weights = given * jnp.where(at_boundary & (huber < 1), 0.0, huber)
     return _Look(

@@ -4,16 +4,26 @@ A new scheme is one more line in `CASES`.
 """
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
-import jax
+import meshes
 import numpy as np
 import pytest
-
-import jaxsubdiv as js
 from meshes import Mesh
 
+import jaxsubdiv as js
+
 LEVELS = 2
+# One mesh holds what a rule can meet, so that every scheme is compiled once for most of the tests: both kinds of faces,
+# closed and open components, valences 3 to 8 and faces that share one vertex only.
+BOW_TIE = (np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (-1, 0, 0.5), (-1, -1, 0)]), [(0, 1, 2), (0, 3, 4)])
+PARTS = (meshes.mixed_closed(), meshes.fan(7), meshes.grid(3, 2, "mixed", bumpy=0.2), BOW_TIE)
+PART = np.repeat(range(len(PARTS)), [len(vertices) for vertices, _ in PARTS])
+SHEET = 2
+MIXED = meshes.union(*PARTS)
+QUADS = meshes.union(meshes.cube(), meshes.torus(4, 3), meshes.grid(3, 2, bumpy=0.2))
+TRIANGLES = meshes.union(meshes.fan(8), meshes.torus(4, 3, "triangle"), meshes.grid(2, 2, "triangle", bumpy=0.2))
 
 
 class Case(NamedTuple):
@@ -34,7 +44,7 @@ def _interpolating(twist: str, weights: str, old_normals: str, boundary: str, h:
     changed = [value for key, value in options.items() if value != getattr(js.Interpolating(), key)]
     name = "-".join(changed + ["h_by_level"] * np.ndim(h)) or "default"
     # The printed twist adds unit normals to lengths, with signs that go by the first corner.
-    lacks = frozenset({"scale", "first corner", "sphere"} if twist == "printed" else {"sphere"})
+    lacks = frozenset({"scale", "flat at h = 0", "first corner", "sphere"} if twist == "printed" else {"sphere"})
     return Case(name, js.Interpolating(h, **options), options, lacks)
 
 
@@ -66,10 +76,24 @@ def control_mesh(mesh: Mesh) -> js.ControlMesh:
     return js.ControlMesh(vertices, sorted(faces, key=len))
 
 
-def refine_eagerly(scheme: js.AbstractScheme, topology: js.Topology, control: js.Control) -> js.RefinedSurface:
-    """`refine`, one operation after the other: for one-off sizes this costs less than compiling all of it."""
-    with jax.disable_jit():
-        return js.refine(scheme, topology, control)
+@functools.cache
+def mixed_topology(recompute: bool) -> js.Topology:
+    scheme = js.Interpolating(old_normals="recompute" if recompute else "keep")
+    return js.build_topology(control_mesh(MIXED), scheme, LEVELS)
+
+
+def refine_mixed(case: Case, control: js.Control) -> js.RefinedSurface:
+    """Refine with the faces of `MIXED`, triangles first."""
+    return js.refine(case.scheme, mixed_topology(case.scheme.recomputes_normals), control)
+
+
+def inherited(topology: js.Topology, values: np.ndarray) -> np.ndarray:
+    """A value for every control vertex, handed down to the mean of the parents' values. Labels of components stay."""
+    for level in topology.levels:
+        values = np.concatenate(
+            [values, *(values[np.asarray(rows)].mean(axis=1) for rows in (level.edges, level.quads))]
+        )
+    return values
 
 
 def random_control(mesh: Mesh, seed: int, bumps: float = 0.05) -> js.Control:

@@ -80,7 +80,9 @@ def at_random(name: str) -> Derivatives:
         jax.tree.unflatten(jax.tree.structure(at), [jnp.asarray(use * leaf) for use, leaf in zip(uses, (h, x, n))])
         for uses in [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)]
     ]
-    return derivatives(case, [moved(at, t, s * STEP) for t in along for s in (0, 1, -1)], [t for t in along for _ in "012"])
+    return derivatives(
+        case, [moved(at, t, s * STEP) for t in along for s in (0, 1, -1)], [t for t in along for _ in "012"]
+    )
 
 
 def rows(tree: Any) -> np.ndarray:
@@ -182,7 +184,9 @@ def test_circle_factor_is_flat_beyond_120_degrees_only(degrees):
     assert np.any(slope) == (degrees < 120)
 
 
-@pytest.mark.parametrize("case", [case for case in CASES if case.name in ("default", "circle")], ids=lambda case: case.name)
+@pytest.mark.parametrize(
+    "case", [case for case in CASES if case.name in ("default", "circle")], ids=lambda case: case.name
+)
 def test_compiled_gradients_of_a_batch_agree_with_central_differences(case):
     topology = js.build_topology(control_mesh(MESH), case.scheme, 2)
     at = point(case, random_control(MESH, seed=2, bumps=0.2))
