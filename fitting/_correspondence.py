@@ -64,27 +64,56 @@ def nearest_rows(
 
 
 def _nearest_triangle(corners: _Triangles, points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, "p"]:
-    n_triangles = len(corners.a)
     centres = (corners.a + corners.b + corners.c) / 3
-    reach = max(np.sqrt(((corner - centres) ** 2).sum(axis=1).max()) for corner in corners)
+    radii = np.sqrt(np.max([((corner - centres) ** 2).sum(axis=1) for corner in corners], axis=0))
+    reach = radii.max()
     tree = KDTree(centres)
-    nearest = np.zeros(len(points), np.int64)
-    open_rows, k = np.arange(len(points)), min(_FIRST_CANDIDATES, n_triangles)
-    while len(open_rows):
-        unsure = []
-        for rows in np.array_split(open_rows, -(-len(open_rows) * k // _PAIRS_AT_ONCE)):
-            to_centre, candidates = nearest_rows(tree, points[rows], k)
-            squared, _ = _distance_squared(
-                _Triangles(*(corner[candidates] for corner in corners)), points[rows][:, None]
-            )
-            best = squared.argmin(axis=1)
-            along = np.arange(len(rows))
-            nearest[rows] = candidates[along, best]
-            # A triangle lies within `reach` of its centre, so the next centre cannot belong to a nearer one.
-            unsure.append(rows[np.sqrt(squared[along, best]) + reach > to_centre[:, -1]])
-        open_rows = np.concatenate(unsure) if k < n_triangles else np.zeros(0, np.int64)
-        k = min(4 * k, n_triangles)
+    k = min(_FIRST_CANDIDATES, len(centres))
+    nearest, distance = np.zeros(len(points), np.int64), np.zeros(len(points))
+    unsure = []
+    for rows in _chunks(np.full(len(points), k)):
+        to_centre, candidates = nearest_rows(tree, points[rows], k)
+        squared, _ = _distance_squared(_Triangles(*(corner[candidates] for corner in corners)), points[rows][:, None])
+        best, along = squared.argmin(axis=1), np.arange(len(rows))
+        nearest[rows], distance[rows] = candidates[along, best], np.sqrt(squared[along, best])
+        # A triangle lies within `reach` of its centre: where the last centre is farther than that, none was missed.
+        unsure.append(rows[distance[rows] + reach > to_centre[:, -1]])
+    rest = np.concatenate(unsure) if k < len(centres) else np.zeros(0, np.int64)
+    counts = tree.query_ball_point(points[rest], distance[rest] + reach, workers=-1, return_length=True)
+    for part in _chunks(np.asarray(counts)):
+        rows = rest[part]
+        nearest[rows] = _nearest_in_reach(tree, corners, centres, radii, points[rows], distance[rows])
     return nearest
+
+
+def _nearest_in_reach(
+    tree: KDTree,
+    corners: _Triangles,
+    centres: Float[np.ndarray, "t 3"],
+    radii: Float[np.ndarray, "t"],
+    points: Float[np.ndarray, "p 3"],
+    distance: Float[np.ndarray, "p"],
+) -> Int[np.ndarray, "p"]:
+    """Nearest triangle, given one that is `distance` off: looks at all that can be nearer."""
+    distance = distance * (1 + 1e-9)  # so that rounding cannot lose the triangle that gave it
+    lists = tree.query_ball_point(points, distance + radii.max(), workers=-1)
+    triangle = np.concatenate([np.asarray(found, np.int64) for found in lists])
+    point = np.repeat(np.arange(len(points)), [len(found) for found in lists])
+    to_centre = np.sqrt(((points[point] - centres[triangle]) ** 2).sum(axis=1))
+    closer = to_centre - radii[triangle] <= distance[point]
+    point, triangle = point[closer], triangle[closer]
+    squared, _ = _distance_squared(_Triangles(*(corner[triangle] for corner in corners)), points[point])
+    order = np.lexsort((squared, point))
+    first = order[np.searchsorted(point[order], np.arange(len(points)))]  # every point still has the one it came with
+    return triangle[first]
+
+
+def _chunks(counts: Int[np.ndarray, "n"]) -> list[Int[np.ndarray, "m"]]:
+    """Rows in runs that hold `_PAIRS_AT_ONCE` pairs or less, or one row each."""
+    if len(counts) == 0:
+        return []
+    run = np.cumsum(counts) // _PAIRS_AT_ONCE
+    return np.split(np.arange(len(counts)), np.flatnonzero(np.diff(run)) + 1)
 
 
 def _distance_squared(

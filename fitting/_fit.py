@@ -20,15 +20,15 @@ from ._correspondence import boundary_vertices, closest_points
 from ._free import Free, apply_offset, no_offset
 from ._residuals import Correspondence, Priors, Start, residuals
 from ._result import FitResult
+from ._robust import AbstractLoss, geman_mcclure, noise_scale
 from ._scan import Scan, ScanError
 
 # Few steps a sweep: with points paired wrongly still, an exact solution would follow the pairing.
 _STEPS_A_SWEEP = 3
 # Inner iterations end at this relative accuracy; a tighter solve costs more than the next sweep gains.
 _LINEAR_TOLERANCE = 1e-3
-# Huber's constant: beyond 1.345 sigma of Gaussian noise, 95 % efficiency; three times that leaves honest points alone.
-_HUBER = 3 * 1.345
-_MAD_TO_SIGMA = 1.4826
+# A point beyond an open boundary and this many sigma off belongs to what the control mesh does not cover.
+_BEYOND = 4.0
 _ON_BOUNDARY = 1e-3  # how far, in parts of a face, a surface point may lie from a boundary and count as on it
 # A start that is off by more than this part of the control mesh's size is not roughly aligned.
 _FAR = 0.05
@@ -41,6 +41,7 @@ class Sweep(NamedTuple):
 
     number: int
     rms: float
+    """Root mean square distance in mm, every point by its robust weight."""
 
 
 def fit(
@@ -51,6 +52,7 @@ def fit(
     *,
     free: Free = Free(),  # noqa: B008  # immutable
     priors: Priors = Priors(),  # noqa: B008  # immutable
+    loss: AbstractLoss = geman_mcclure(),  # noqa: B008  # immutable
     max_sweeps: int = 60,
     tolerance: float = 2e-3,
     throw: bool = True,
@@ -60,7 +62,8 @@ def fit(
 
     Every sweep pairs each scan point with the closest point of the surface, then takes a few Levenberg-Marquardt steps
     on the distances, most of all those across the surface, and on the priors. Points far out beyond the noise lose
-    weight (Huber, scale from the median absolute distance).
+    weight by a robust loss, whose scale is the noise that the distances show; it falls to that from a large one, sweep
+    by sweep (graduated non-convexity), so that a start that is far off is not taken for outliers.
 
     Args:
         scheme: the scheme; its h is where the fit starts.
@@ -69,8 +72,9 @@ def fit(
         scan: the measured points in mm.
         free: what may move.
         priors: strengths of what is known beforehand.
+        loss: how a point loses weight with its distance. The default bears a majority of outliers; `Huber` is milder.
         max_sweeps: how many sweeps at most.
-        tolerance: converged once a sweep with the final fairness changes the RMS distance by less than this part of it.
+        tolerance: converged once a sweep, annealed, changes the robust RMS distance by less than this part of it.
         throw: raise where the fit did not converge, or return the reason in `FitResult.result`.
         on_sweep: called after every sweep, for progress.
 
@@ -80,13 +84,14 @@ def fit(
         ValueError: the topology has no levels, or does not fit the control.
         RuntimeError: with `throw`, the fit did not converge or met values that are not finite.
     """
-    _check(topology, control, scan)
+    _check(scheme, topology, control, scan)
     control = js.Control(control.vertices, _given_normals(topology, control))
     surface = js.refine(scheme, topology, control)
     open_vertices = boundary_vertices(surface)
-    seen = _look(surface, scan, open_vertices)
-    _warn_if_far(float(seen.rms), control)
-    rms, result = [float(seen.rms)], optx.RESULTS.nonlinear_max_steps_reached
+    seen = _look(surface, scan, open_vertices, loss, np.inf)
+    widest = float(seen.scale)
+    _warn_if_far(float(np.median(np.abs(seen.distances))), control)
+    rms, robust_rms, result = [float(seen.rms)], [float(seen.robust_rms)], optx.RESULTS.nonlinear_max_steps_reached
     for sweep in range(max_sweeps):
         fairness = priors.fairness_in(sweep)
         proposed = _sweep(free, Start(scheme, topology, control, seen.pairs, priors, fairness))
@@ -95,11 +100,14 @@ def fit(
             result = optx.RESULTS.nonfinite  # what the last sound sweep found is what comes back
             break
         (scheme, control), surface = proposed, refined
-        seen = _look(surface, scan, open_vertices)
+        floor = widest * 0.5 ** (sweep + 1)
+        seen = _look(surface, scan, open_vertices, loss, floor)
         rms.append(float(seen.rms))
+        robust_rms.append(float(seen.robust_rms))
         if on_sweep is not None:
-            on_sweep(Sweep(sweep + 1, rms[-1]))
-        if fairness <= priors.fairness and abs(rms[-2] - rms[-1]) <= tolerance * rms[-1]:
+            on_sweep(Sweep(sweep + 1, robust_rms[-1]))
+        annealed = fairness <= priors.fairness and floor <= seen.scale
+        if annealed and abs(robust_rms[-2] - robust_rms[-1]) <= tolerance * robust_rms[-1]:
             result = optx.RESULTS.successful
             break
     found = FitResult(
@@ -111,6 +119,8 @@ def fit(
         distances=np.asarray(seen.distances),
         weights=np.asarray(seen.weights),
         rms=np.array(rms),
+        robust_rms=np.array(robust_rms),
+        noise=float(seen.scale),
         result=result,
     )
     if throw and result != optx.RESULTS.successful:
@@ -146,33 +156,52 @@ class _Look(NamedTuple):
     distances: Float[Array, "p"]
     """Signed, positive outside."""
     weights: Float[Array, "p"]
+    scale: Float[Array, ""]
+    """Of the robust loss: the noise, or what the annealing keeps it at."""
     rms: Float[Array, ""]
+    robust_rms: Float[Array, ""]
 
 
-def _look(surface: js.RefinedSurface, scan: Scan, open_vertices: Bool[np.ndarray, "v"]) -> _Look:
-    return _measure(surface, scan, closest_points(surface, np.asarray(scan.points)), open_vertices)
+def _look(
+    surface: js.RefinedSurface,
+    scan: Scan,
+    open_vertices: Bool[np.ndarray, "v"],
+    loss: AbstractLoss,
+    floor: float,
+) -> _Look:
+    at = closest_points(surface, np.asarray(scan.points))
+    return _measure(surface, scan, at, open_vertices, loss, jnp.asarray(floor, scan.points.dtype))
 
 
 @jax.jit
 def _measure(
-    surface: js.RefinedSurface, scan: Scan, at: js.SurfacePoint, open_vertices: Bool[Array | np.ndarray, "v"]
+    surface: js.RefinedSurface,
+    scan: Scan,
+    at: js.SurfacePoint,
+    open_vertices: Bool[Array | np.ndarray, "v"],
+    loss: AbstractLoss,
+    floor: Float[Array, ""],
 ) -> _Look:
     on, normals = js.evaluate(surface, at)
     away = scan.points - on
     distance, given = norm(away)[:, 0], scan.weights_or_ones()
-    # Points without weight have no say in the scale.
-    sigma = _MAD_TO_SIGMA * jnp.nanmedian(jnp.where(given > 0, distance, jnp.nan))
-    huber = jnp.minimum(1.0, _HUBER * sigma / jnp.maximum(distance, jnp.finfo(distance.dtype).tiny))
     corners, inside = corner_weights(surface, at)
     at_boundary = jnp.sum(jnp.where(open_vertices[corners], inside, 0.0), axis=1) > 1 - _ON_BOUNDARY
-    # Beyond an open boundary a point that is far off belongs to what the control mesh does not cover.
-    weights = given * jnp.where(at_boundary & (huber < 1), 0.0, huber)
+    # Beyond a boundary the distance runs along the surface, and says nothing of the noise across it.
+    counted = jnp.where(at_boundary, 0.0, given)
+    # An infinite floor asks for the widest scale: every point that is not far beyond the rest counts in full.
+    widest = 3 * jnp.sqrt(jnp.average(distance**2, weights=given))
+    scale = jnp.maximum(noise_scale(distance, counted), jnp.minimum(floor, widest))
+    weights = given * loss.weight(distance / jnp.maximum(scale, jnp.finfo(scale.dtype).tiny))
+    weights = jnp.where(at_boundary & (distance > _BEYOND * scale), 0.0, weights)
     return _Look(
         at=at,
         pairs=Correspondence(scan.points, corners, inside, normals, weights / jnp.mean(weights), at_boundary),
         distances=jnp.where(dot(normals, away)[:, 0] < 0, -distance, distance),
         weights=weights,
+        scale=scale,
         rms=jnp.sqrt(jnp.average(distance**2, weights=given)),
+        robust_rms=jnp.sqrt(jnp.average(distance**2, weights=weights)),
     )
 
 
@@ -183,20 +212,29 @@ def _given_normals(topology: js.Topology, control: js.Control) -> Float[Array, "
     return jnp.where(missing, js.estimate_normals(topology.control_fans, control.vertices), normals)
 
 
-def _warn_if_far(rms: float, control: js.Control) -> None:
+def _warn_if_far(off: float, control: js.Control) -> None:
     size = float(np.linalg.norm(np.ptp(np.asarray(control.vertices), axis=0)))
-    if rms > _FAR * size:
+    if off > _FAR * size:
         warnings.warn(
-            f"the scan lies {rms:.3g} mm (RMS) from the surface at the start, which measures {size:.3g} mm across: "
+            f"half of the scan lies over {off:.3g} mm from the surface at the start, which is {size:.3g} mm across: "
             "points will be paired with the wrong places. Align the control mesh with the scan first; axes named in "
             "another order or a mirrored side are common causes.",
             stacklevel=3,
         )
 
 
-def _check(topology: js.Topology, control: js.Control, scan: Scan) -> None:
+def _check(scheme: js.AbstractScheme, topology: js.Topology, control: js.Control, scan: Scan) -> None:
     if not topology.levels:
         raise ValueError("a fit needs a topology of one level or more; this one has none. Two or three serve well.")
+    eqx.filter_eval_shape(js.refine, scheme, topology, control)  # for its checks of the shapes
+    # The solver keeps its own state in the default dtype, and cannot mix it with another.
+    dtypes, default = (control.vertices.dtype, scan.points.dtype), jnp.result_type(float)
+    if any(dtype != default for dtype in dtypes):
+        raise ValueError(
+            f"control mesh and scan must have JAX's default floating dtype, {default}; got {dtypes[0]} and {dtypes[1]}."
+        )
+    if not all(np.isfinite(values).all() for values in (control.vertices, scheme.h)):
+        raise ValueError("the control vertices or h are not finite: there is no surface to start from.")
     n_needed = control.vertices.shape[0]
     if scan.n_points < n_needed:
         raise ScanError(
@@ -206,6 +244,8 @@ def _check(topology: js.Topology, control: js.Control, scan: Scan) -> None:
     sizes = [float(np.linalg.norm(np.ptp(np.asarray(rows), axis=0))) for rows in (scan.points, control.vertices)]
     if sizes[0] == 0:
         raise ScanError("all scan points lie on one spot. Check the columns of the file.")
+    if sizes[1] == 0:
+        raise ValueError("all control vertices lie on one spot: there is no surface to start from.")
     ratio = sizes[0] / sizes[1]
     if not 1 / _UNIT_RATIO <= ratio <= _UNIT_RATIO:
         raise ScanError(

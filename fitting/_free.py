@@ -51,11 +51,12 @@ def no_offset(free: Free, scheme: js.AbstractScheme, control: js.Control) -> Unk
 def apply_offset(
     topology: js.Topology, scheme: js.AbstractScheme, control: js.Control, offset: Unknowns
 ) -> tuple[js.AbstractScheme, js.Control]:
-    """Scheme and control with the offset put on; unit normals."""
-    vertices, normals = control.vertices, unit(control.normals)
+    """Scheme and control with the offset put on: normals that turn become unit, what is not free stays bit for bit."""
+    vertices, normals = control.vertices, control.normals
     length = edge_length(topology, control.vertices)
     if offset.normals is not None:
         # By eq. (2) an edge point moves by an eighth of the edge for a normal that turns by one radian.
+        normals = unit(normals)
         first, second = tangents(normals)
         turn = offset.normals[:, :1] * first + offset.normals[:, 1:] * second
         normals = unit(normals + turn * (8 / length))

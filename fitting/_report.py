@@ -14,7 +14,9 @@ class Report:
         rms_start, rms: root mean square distance before and after.
         mean, median, percentile_95, maximum: of the absolute distance.
         bias: mean signed distance, positive where the points lie outside.
-        full_weight_share: share of the points that no robust weight held back.
+        noise: standard deviation of the Gaussian part of the distances.
+        inlier_share: share of the points within three times the noise.
+        rms_inliers: root mean square distance of these.
         h: fitted tangent length coefficient, one or one a level.
         rms_per_sweep: at the start, then after every sweep.
     """
@@ -30,7 +32,9 @@ class Report:
     maximum: float
     bias: float
     n_points: int
-    full_weight_share: float
+    noise: float
+    inlier_share: float
+    rms_inliers: float
     n_control_vertices: int
     n_faces: int
     h: float | list[float]
@@ -45,7 +49,8 @@ class Report:
             ("mean / median", f"{self.mean:.3f} / {self.median:.3f} mm"),
             ("95th percentile / maximum", f"{self.percentile_95:.3f} / {self.maximum:.3f} mm"),
             ("bias (outside is positive)", f"{self.bias:+.3f} mm"),
-            ("scan points", f"{self.n_points:,}, {self.full_weight_share:.1%} at full weight"),
+            ("scan points", f"{self.n_points:,}, {self.inlier_share:.1%} within 3 x the noise of {self.noise:.3f} mm"),
+            ("RMS of these", f"{self.rms_inliers:.3f} mm"),
             ("control vertices", f"{self.n_control_vertices:,}"),
             ("faces of the surface", f"{self.n_faces:,}"),
             ("tangent length h", h),

@@ -4,7 +4,7 @@ from typing import final
 
 import numpy as np
 import optimistix as optx
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 import jaxsubdiv as js
 
@@ -23,8 +23,12 @@ class FitResult:
         scan: the scan that was fitted.
         at: the surface point closest to every scan point.
         distances: signed distance of every scan point from the surface in mm, positive outside.
-        weights: how much every point counted in the last sweep.
+        weights: how much every point counts at the end: its own weight times the robust one.
+        inliers: points within three times the noise.
         rms: root mean square distance of the scan points to the surface in mm: at the start, then after every sweep.
+        robust_rms: the same with every point by its robust weight, so that outliers do not hide the rest.
+        noise: standard deviation in mm of the Gaussian part of the distances: the noise of the scan, and the detail
+            that the control mesh is too coarse for.
         result: `optimistix.RESULTS.successful`, or why the fit stopped without having converged.
     """
 
@@ -39,6 +43,8 @@ class FitResult:
         distances: Float[np.ndarray, "p"],
         weights: Float[np.ndarray, "p"],
         rms: Float[np.ndarray, "sweeps"],
+        robust_rms: Float[np.ndarray, "sweeps"],
+        noise: float,
         result: optx.RESULTS,
     ):
         self.control = control
@@ -49,7 +55,13 @@ class FitResult:
         self.distances = distances
         self.weights = weights
         self.rms = rms
+        self.robust_rms = robust_rms
+        self.noise = noise
         self.result = result
+
+    @property
+    def inliers(self) -> Bool[np.ndarray, "p"]:
+        return np.abs(self.distances) <= 3 * self.noise
 
     def report(self) -> Report:
         """The fit in numbers: `print` it, or take `.as_dict()`."""
@@ -65,9 +77,15 @@ class FitResult:
             maximum=float(np.max(np.abs(self.distances))),
             bias=float(np.mean(self.distances)),
             n_points=self.scan.n_points,
-            full_weight_share=float(np.mean(self.weights >= 0.999 * np.asarray(self.scan.weights_or_ones()))),
+            noise=self.noise,
+            inlier_share=float(np.mean(self.inliers)),
+            rms_inliers=_rms(self.distances[self.inliers]),
             n_control_vertices=self.control.vertices.shape[0],
             n_faces=self.surface.n_faces,
             h=np.asarray(self.scheme.h).tolist(),
             rms_per_sweep=[float(value) for value in self.rms],
         )
+
+
+def _rms(distances: Float[np.ndarray, "p"]) -> float:
+    return float(np.sqrt(np.mean(distances**2))) if len(distances) else 0.0
