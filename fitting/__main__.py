@@ -109,7 +109,7 @@ class _Progress:
         except ImportError:
             self._bar = None
         else:
-            self._bar = tqdm(total=self._max_sweeps, unit="sweep", desc="sweeps at most", leave=False)
+            self._bar = tqdm(total=self._max_sweeps, unit="sweep", desc="sweeps at most", leave=False, disable=None)
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -17,7 +17,7 @@ from jaxsubdiv._linalg import dot, norm, unit
 from jaxsubdiv._surface import corner_weights
 
 from ._correspondence import boundary_vertices, closest_points
-from ._free import Free, apply_offset, no_offset
+from ._free import Free, apply_offset, edge_length, no_offset
 from ._residuals import Correspondence, Priors, Start, residuals
 from ._result import FitResult
 from ._robust import AbstractLoss, geman_mcclure, noise_scale
@@ -27,7 +27,7 @@ from ._scan import Scan, ScanError
 _STEPS_A_SWEEP = 3
 # Inner iterations end at this relative accuracy; a tighter solve costs more than the next sweep gains.
 _LINEAR_TOLERANCE = 1e-3
-# A point beyond an open boundary and this many sigma off belongs to what the control mesh does not cover.
+# A point beyond an open boundary by this many sigma, or by a control edge, belongs to what the mesh does not cover.
 _BEYOND = 4.0
 _ON_BOUNDARY = 1e-3  # how far, in parts of a face, a surface point may lie from a boundary and count as on it
 # A start that is off by more than this part of the control mesh's size is not roughly aligned.
@@ -87,8 +87,8 @@ def fit(
     _check(scheme, topology, control, scan)
     control = js.Control(control.vertices, _given_normals(topology, control))
     surface = js.refine(scheme, topology, control)
-    open_vertices = boundary_vertices(surface)
-    seen = _look(surface, scan, open_vertices, loss, np.inf)
+    open_vertices, edge = boundary_vertices(surface), float(edge_length(topology, control.vertices))
+    seen = _look(surface, scan, open_vertices, edge, loss, np.inf)
     widest = float(seen.scale)
     _warn_if_far(float(np.median(np.abs(seen.distances))), control)
     rms, robust_rms, result = [float(seen.rms)], [float(seen.robust_rms)], optx.RESULTS.nonlinear_max_steps_reached
@@ -101,7 +101,7 @@ def fit(
             break
         (scheme, control), surface = proposed, refined
         floor = widest * 0.5 ** (sweep + 1)
-        seen = _look(surface, scan, open_vertices, loss, floor)
+        seen = _look(surface, scan, open_vertices, edge, loss, floor)
         rms.append(float(seen.rms))
         robust_rms.append(float(seen.robust_rms))
         if on_sweep is not None:
@@ -166,11 +166,12 @@ def _look(
     surface: js.RefinedSurface,
     scan: Scan,
     open_vertices: Bool[np.ndarray, "v"],
+    edge: float,
     loss: AbstractLoss,
     floor: float,
 ) -> _Look:
     at = closest_points(surface, np.asarray(scan.points))
-    return _measure(surface, scan, at, open_vertices, loss, jnp.asarray(floor, scan.points.dtype))
+    return _measure(surface, scan, at, open_vertices, edge, loss, jnp.asarray(floor, scan.points.dtype))
 
 
 @jax.jit
@@ -179,6 +180,7 @@ def _measure(
     scan: Scan,
     at: js.SurfacePoint,
     open_vertices: Bool[Array | np.ndarray, "v"],
+    edge: float | Float[Array, ""],
     loss: AbstractLoss,
     floor: Float[Array, ""],
 ) -> _Look:
@@ -193,7 +195,7 @@ def _measure(
     widest = 3 * jnp.sqrt(jnp.average(distance**2, weights=given))
     scale = jnp.maximum(noise_scale(distance, counted), jnp.minimum(floor, widest))
     weights = given * loss.weight(distance / jnp.maximum(scale, jnp.finfo(scale.dtype).tiny))
-    weights = jnp.where(at_boundary & (distance > _BEYOND * scale), 0.0, weights)
+    weights = jnp.where(at_boundary & (distance > jnp.minimum(_BEYOND * scale, edge)), 0.0, weights)
     return _Look(
         at=at,
         pairs=Correspondence(scan.points, corners, inside, normals, weights / jnp.mean(weights), at_boundary),

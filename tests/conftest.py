@@ -21,3 +21,22 @@ def shared_data() -> Path:
         if folder.is_dir():
             return folder
     pytest.skip("the shared data are not beside this checkout")
+
+
+@pytest.fixture
+def as_users_run():
+    """Without the checks of annotations, which would speak before the library's own words on bad arguments."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture
+def command_settings(tmp_path, monkeypatch):
+    """The commands' settings of JAX put back, and nothing written into the home folder."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
+    names = ("jax_enable_x64", "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = {name: getattr(jax.config, name) for name in names}
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)

@@ -102,8 +102,8 @@ def union(*parts: Mesh) -> Mesh:
     return np.concatenate(vertices), faces
 
 
-def relabelled(mesh: Mesh, seed: int) -> tuple[Mesh, np.ndarray, np.ndarray]:
-    """The same mesh told otherwise: vertices and faces in another order, faces from another first corner.
+def relabelled(mesh: Mesh, seed: int, turn: bool = True) -> tuple[Mesh, np.ndarray, np.ndarray]:
+    """The same mesh told otherwise: vertices and faces in another order, and with `turn` faces from any first corner.
 
     Returns:
         The mesh; for each of its vertices the old one; for each of its faces the old one.
@@ -111,7 +111,7 @@ def relabelled(mesh: Mesh, seed: int) -> tuple[Mesh, np.ndarray, np.ndarray]:
     (vertices, faces), rng = mesh, np.random.default_rng(seed)
     of_vertex, of_face = rng.permutation(len(vertices)), rng.permutation(len(faces))
     label = np.argsort(of_vertex)
-    turned = [np.roll(label[list(faces[i])], rng.integers(4)) for i in of_face]
+    turned = [np.roll(label[list(faces[i])], rng.integers(4) if turn else 0) for i in of_face]
     return (vertices[of_vertex], [tuple(map(int, face)) for face in turned]), of_vertex, of_face
 
 

@@ -33,8 +33,8 @@ def unit(vector: Array) -> Array:
 
 
 def tangent(p_i: Array, n_i: Array, p_j: Array, h: float) -> Array:
-    """(1): m_ij = h (n_i x (P_j - P_i)) x n_i, n_i a unit vector; h (P_j - P_i) where n_i is missing (zero), which bends
-    nothing. h (d - (n_i.d) n_i), d = P_j - P_i, is both."""
+    """(1): m_ij = h (n_i x (P_j - P_i)) x n_i, n_i a unit vector; h (P_j - P_i) where n_i is missing (zero), so that
+    nothing bends there: h (d - (n_i.d) n_i) with d = P_j - P_i is both."""
     if not n_i.any():
         return h * (p_j - p_i)
     return h * np.cross(np.cross(n_i, p_j - p_i), n_i)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import meshes
 import numpy as np
 import pytest
-from schemes import CASES, Case, control_mesh, over_cases, random_control
+from schemes import Case, by_name, control_mesh, over_cases, random_control
 
 import jaxsubdiv as js
 from jaxsubdiv._scheme.circle_preserving import arc_factor
@@ -72,17 +72,14 @@ def moved(at: Point, along: Point, step: float) -> Point:
 def at_random(name: str) -> Derivatives:
     """Rows 3 i, 3 i + 1, 3 i + 2: a random point, and the same a step ahead and a step back along direction i: h, the
     vertices, the normals, and all of them."""
-    case = next(case for case in CASES if case.name == name)
+    case = by_name(name)
     at = point(case, random_control(MESH, seed=0, bumps=0.2))
     rng = np.random.default_rng(1)
     h, x, n = (rng.normal(size=leaf.shape) for leaf in jax.tree.leaves(at))
-    along = [
-        jax.tree.unflatten(jax.tree.structure(at), [jnp.asarray(use * leaf) for use, leaf in zip(uses, (h, x, n))])
-        for uses in [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)]
-    ]
-    return derivatives(
-        case, [moved(at, t, s * STEP) for t in along for s in (0, 1, -1)], [t for t in along for _ in "012"]
-    )
+    parts = [(h, 0 * x, 0 * n), (0 * h, x, 0 * n), (0 * h, 0 * x, n), (h, x, n)]
+    along = [jax.tree.unflatten(jax.tree.structure(at), list(map(jnp.asarray, part))) for part in parts]
+    steps = [(t, step) for t in along for step in (0.0, STEP, -STEP)]
+    return derivatives(case, [moved(at, t, step) for t, step in steps], [t for t, _ in steps])
 
 
 def rows(tree: Any) -> np.ndarray:
@@ -149,7 +146,7 @@ CORNERS = _corners()
 @functools.cache
 def at_corners(name: str) -> Derivatives:
     """One row for each of `CORNERS`."""
-    case = next(case for case in CASES if case.name == name)
+    case = by_name(name)
     at = [point(case, control) for control in CORNERS.values()]
     ones = jax.tree.map(jnp.ones_like, at[0])
     return derivatives(case, at, [ones] * len(at))
@@ -163,6 +160,19 @@ def test_derivatives_are_finite_where_formulas_have_none(case, corner):
         assert np.isfinite(rows(part)[row]).all()
     # Nothing is divided by a length that vanishes: a guard that only just holds would leave a huge number here.
     assert np.abs(rows(d.gradient)[row]).max() < 1e4
+
+
+@over_cases()
+def test_normal_is_that_of_the_parents_where_the_sum_vanishes(case):
+    d, row = at_corners(case.name), list(CORNERS).index("folded")
+    level = js.build_topology(control_mesh(MESH), case.scheme, 1).levels[0]
+    normals = d.value[row, d.value.shape[1] // 2 :]
+    parents = np.asarray(CORNERS["folded"].normals)
+    parents = parents / np.linalg.norm(parents, axis=1, keepdims=True)
+    back_to_back = np.flatnonzero((np.sort(level.edges, axis=1) == (1, 4)).all(axis=1))
+    for vertex, of in ((len(VERTICES) + back_to_back[0], [1, 4]), (-1, [0, 1, 2, 3])):
+        mean = parents[of].sum(axis=0)
+        np.testing.assert_allclose(normals[vertex], mean / np.linalg.norm(mean), rtol=0, atol=1e-14)
 
 
 @over_cases()
@@ -184,9 +194,7 @@ def test_circle_factor_is_flat_beyond_120_degrees_only(degrees):
     assert np.any(slope) == (degrees < 120)
 
 
-@pytest.mark.parametrize(
-    "case", [case for case in CASES if case.name in ("default", "circle")], ids=lambda case: case.name
-)
+@pytest.mark.parametrize("case", [by_name("default"), by_name("circle")], ids=lambda case: case.name)
 def test_compiled_gradients_of_a_batch_agree_with_central_differences(case):
     topology = js.build_topology(control_mesh(MESH), case.scheme, 2)
     at = point(case, random_control(MESH, seed=2, bumps=0.2))
@@ -202,3 +210,14 @@ def test_compiled_gradients_of_a_batch_agree_with_central_differences(case):
     values, slopes = value_and_slope(batch)
     slope = sum(jax.tree.leaves(jax.tree.map(lambda s, t: jnp.vdot(s[0], t), slopes, along)))
     np.testing.assert_allclose(slope, (values[1] - values[2]) / (2 * STEP), rtol=0, atol=1e-7)
+
+
+@over_cases()
+def test_rows_of_a_batch_run_one_by_one_equal_compiled_single_runs(case):
+    d = at_random(case.name)
+    topology = js.build_topology(control_mesh(MESH), case.scheme, 1)
+    for row in (0, 7):
+        scheme, control = jax.tree.map(lambda leaf, row=row: leaf[row], d.at)
+        surface = js.refine(scheme, topology, control)
+        single = np.concatenate([surface.vertices, surface.normals])
+        np.testing.assert_allclose(single, d.value[row], rtol=0, atol=1e-14)

@@ -4,14 +4,19 @@ import meshes
 import numpy as np
 import pytest
 import reference
-from schemes import CASES, LEVELS, MIXED, QUADS, TRIANGLES, Case, control_mesh, random_control
+from schemes import CASES, LEVELS, MIXED, QUADS, TRIANGLES, Case, by_name, control_mesh, random_control
 
 import jaxsubdiv as js
 
 # Meshes of one kind of faces have tables of their own shape; the rules that run on them are the same.
-SOME = [case for case in CASES if case.name in ("default", "printed-angle-recompute", "circle")]
-PAIRS = [(case, MIXED) for case in CASES] + [(case, mesh) for mesh in (QUADS, TRIANGLES) for case in SOME]
-NAMES = [case.name for case in CASES] + [f"{case.name}-{kind}" for kind in ("quads", "triangles") for case in SOME]
+ONE_KIND = {
+    "quads": (QUADS, ["default", "printed-angle-recompute", "circle"]),
+    # Compiled for these, edge vertices once differed by rounding from their own copies in their rings.
+    "triangles": (TRIANGLES, ["default", "uniform-recompute", "printed-sphere"]),
+}
+PAIRS = [pytest.param(case, MIXED, id=case.name) for case in CASES] + [
+    pytest.param(by_name(name), mesh, id=f"{name}-{kind}") for kind, (mesh, names) in ONE_KIND.items() for name in names
+]
 
 
 def literal(case: Case, mesh: js.ControlMesh, control: js.Control, levels: int) -> tuple[np.ndarray, np.ndarray, list]:
@@ -33,7 +38,7 @@ def assert_same(surface: js.RefinedSurface, expected: tuple[np.ndarray, np.ndarr
     np.testing.assert_allclose(surface.normals, normals[theirs], rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize(("case", "mesh"), PAIRS, ids=NAMES)
+@pytest.mark.parametrize(("case", "mesh"), PAIRS)
 def test_points_normals_and_faces_agree(case, mesh):
     for seed in range(2):
         told, _, _ = meshes.relabelled(mesh, seed)

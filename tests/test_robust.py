@@ -20,7 +20,7 @@ def barron(r, alpha, c):
 LOSSES = {
     "least squares": (LeastSquares(), lambda r: r**2 / 2),
     "huber": (Huber(1.5), lambda r: jnp.where(abs(r) <= 1.5, r**2 / 2, 1.5 * abs(r) - 1.5**2 / 2)),
-    "cauchy": (cauchy(2.0), lambda r: 2 * jnp.log1p((r / 2) ** 2 / 2)),
+    "cauchy": (cauchy(2.0), lambda r: 4 * jnp.log1p((r / 2) ** 2 / 2)),
     "geman-mcclure": (geman_mcclure(3.0), lambda r: 9 * barron(r, -2.0, 3.0)),
     "pseudo-huber": (Barron(1.0, 2.0), lambda r: 4 * barron(r, 1.0, 2.0)),
     "half way to cauchy": (Barron(0.5, 2.0), lambda r: 4 * barron(r, 0.5, 2.0)),

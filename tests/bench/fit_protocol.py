@@ -1,0 +1,380 @@
+"""How well scans are fitted, beside the tools one would use instead, in the same run.
+
+A synthetic scan of a head whose true surface is known (noise, outliers, a hole), and a coarse template that starts
+off wrong: both drawn from a seed. Lengths in mm. Prints a Markdown table of means over the seeds, and writes JSON.
+
+    pip install -e '.[bench]' && python tests/bench/fit_protocol.py --cases base --seeds 0 1 --output fit.json
+
+The head is not shipped: it is taken from ../shared/data beside the repository, or from --data.
+"""
+
+import argparse
+import functools
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from importlib.metadata import distributions
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+from trimesh import Trimesh
+
+import fitting
+import jaxsubdiv as js
+
+HEAD = "head_colin27.ply"
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+SAMPLES = 100_000  # on each of the two surfaces
+BOX = 1.2  # outliers fill the bounding box of the head, this much larger
+TEMPLATE_VERTICES = 650
+NRICP_VERTICES = 2600  # registration moves vertices only: it needs more of them
+SMOOTHING = 100  # iterations of Taubin on the dense head: takes away what a template of another person would not have
+# Of a warp of 6 mm rms, waves this long leave about 2.4 mm rms after a similarity alignment, as two people differ.
+WARP_LENGTH = 145.0
+WAVES = 64
+VERSIONS = ("jaxsubdiv", "jax", "optimistix", "trimesh", "open3d", "pymeshlab", "pyacvd", "numpy")
+
+
+class Case(NamedTuple):
+    """What is drawn for every seed."""
+
+    points: int = 20_000
+    """Before the hole is cut."""
+    sigma: float = 0.5
+    outliers: float = 0.05
+    """Share of the points."""
+    hole: float = 40.0
+    """Radius of the ball without points."""
+    warp: float = 6.0
+    """Of the template, rms."""
+    rotation: float = 8.0
+    """In degrees."""
+    scale: float = 0.95
+    shift: float = 9.0
+
+
+CASES = {
+    "base": Case(),
+    "outliers-20": Case(outliers=0.2),
+    "outliers-40": Case(outliers=0.4),
+    "outliers-60": Case(outliers=0.6),
+    "sigma-0.25": Case(sigma=0.25),
+    "sigma-1": Case(sigma=1.0),
+    "sigma-2": Case(sigma=2.0),
+    "points-5k": Case(points=5_000),
+    "points-80k": Case(points=80_000),
+    "hole-80": Case(hole=80.0),
+    "warp-12": Case(warp=12.0),
+    "rotation-30": Case(rotation=30.0),
+    "scale-0.8": Case(scale=0.8),
+    "scale-1.2": Case(scale=1.2),
+    "bad-start": Case(warp=12.0, rotation=30.0, scale=0.8),
+}
+
+
+class Samples(NamedTuple):
+    """Points on a surface and the unit normals there."""
+
+    points: Float[np.ndarray, "p 3"]
+    normals: Float[np.ndarray, "p 3"]
+
+
+class Problem(NamedTuple):
+    """What a method is given: the scan, and a template of as many vertices as it asks for."""
+
+    scan: Float[np.ndarray, "p 3"]
+    template: Callable[[int], Trimesh]
+
+
+class Errors(NamedTuple):
+    """Between the fitted and the true surface, both directions pooled, in mm and degrees."""
+
+    total: float
+    data: float
+    hole: float
+    p95: float
+    hausdorff: float
+    normals: float
+
+
+# ---- generator
+
+
+def draw(truth: Trimesh, case: Case, seed: int) -> tuple[Problem, Float[np.ndarray, "3"]]:
+    """The scan and template of a seed, and the centre of the hole. Cases of one seed share what they do not change."""
+    hole_at, scan, start = np.random.default_rng(seed).spawn(3)
+    centre = sample(truth, 1, hole_at).points[0]
+
+    @functools.cache
+    def template(n_vertices: int) -> Trimesh:
+        return make_template(truth, case, n_vertices, start.bit_generator.seed_seq)
+
+    return Problem(make_scan(truth, case, centre, scan), template), centre
+
+
+def make_scan(truth: Trimesh, case: Case, centre: Float[np.ndarray, "3"], rng: np.random.Generator) -> np.ndarray:
+    """Points uniform by area with isotropic noise, among them outliers uniform in a box; none inside the hole."""
+    n_outliers = round(case.outliers * case.points)
+    points = sample(truth, case.points - n_outliers, rng).points
+    points = points + rng.normal(scale=case.sigma, size=points.shape)
+    low, high = truth.bounds
+    outliers = (low + high) / 2 + BOX * (high - low) * rng.uniform(-0.5, 0.5, (n_outliers, 3))
+    scan = np.concatenate([points, outliers])
+    return rng.permutation(scan[np.linalg.norm(scan - centre, axis=1) > case.hole])
+
+
+def make_template(truth: Trimesh, case: Case, n_vertices: int, seed: np.random.SeedSequence) -> Trimesh:
+    """The smoothed head, warped, rotated, scaled, shifted, then remeshed; vertex normals from the dense mesh."""
+    rng = np.random.default_rng(seed)
+    dense = truth.copy()
+    trimesh.smoothing.filter_taubin(dense, iterations=SMOOTHING)
+    x = dense.vertices - dense.centroid
+    warp = smooth_field(x, rng)
+    x = x + case.warp * warp / np.sqrt(np.mean(np.sum(warp**2, axis=1)))
+    axis, shift = directions(rng.normal(size=(2, 3)))
+    x = case.scale * Rotation.from_rotvec(case.rotation * axis, degrees=True).apply(x) + case.shift * shift
+    return remesh(Trimesh(x + dense.centroid, dense.faces, process=False), n_vertices)
+
+
+def smooth_field(x: Float[np.ndarray, "v 3"], rng: np.random.Generator) -> Float[np.ndarray, "v 3"]:
+    """A random field: the sum of waves, whose correlation falls as a Gaussian of the width WARP_LENGTH."""
+    waves, phases = rng.normal(scale=1 / WARP_LENGTH, size=(WAVES, 3)), rng.uniform(0, 2 * np.pi, WAVES)
+    return np.cos(x @ waves.T + phases) @ rng.normal(size=(WAVES, 3))
+
+
+def remesh(dense: Trimesh, n_vertices: int) -> Trimesh:
+    """About `n_vertices` vertices, one a cluster of the dense ones, in even triangles; normals of the dense mesh."""
+    import pyacvd
+    import pyvista
+
+    clustering = pyacvd.Clustering(pyvista.make_tri_mesh(dense.vertices, dense.faces))
+    clustering.cluster(n_vertices)
+    vertices = clustering.create_mesh(clean=False).points
+    # Dense faces between three clusters, as they are wound; create_mesh itself leaves a few faces the wrong way round.
+    # Where two such faces close on each other, a cluster has no more than two neighbours: both faces go, and it goes.
+    corners = clustering.clusters[dense.faces]
+    corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
+    _, first, times = np.unique(np.sort(corners, axis=1), axis=0, return_index=True, return_counts=True)
+    mesh = Trimesh(vertices, corners[first[times == 1]], process=False)
+    mesh.remove_unreferenced_vertices()
+    if not (mesh.is_watertight and mesh.is_winding_consistent and mesh.euler_number == dense.euler_number):
+        raise RuntimeError("pyacvd gave a template that is no closed manifold; take another seed.")
+    normals = dense.vertex_normals[KDTree(dense.vertices).query(mesh.vertices)[1]]
+    return Trimesh(mesh.vertices, mesh.faces, vertex_normals=normals, process=False)
+
+
+# ---- metrics
+
+
+def measure(
+    fitted: Trimesh, truth: Trimesh, centre: Float[np.ndarray, "3"], radius: float, rng: np.random.Generator
+) -> Errors:
+    """Errors over area-weighted samples of both surfaces, each against the exactly closest point of the other.
+
+    A sample counts as in the hole where its place on the true surface is. Normals are interpolated vertex normals.
+    """
+    of_fitted, of_truth = sample(fitted, SAMPLES, rng), sample(truth, SAMPLES, rng)
+    on_truth, on_fitted = nearest(truth, of_fitted.points), nearest(fitted, of_truth.points)
+    pairs = ((of_fitted, on_truth), (of_truth, on_fitted))
+    distance = np.concatenate([np.linalg.norm(a.points - b.points, axis=1) for a, b in pairs])
+    cosine = np.concatenate([np.sum(a.normals * b.normals, axis=1) for a, b in pairs])
+    places = np.concatenate([on_truth.points, of_truth.points])
+    in_hole = np.linalg.norm(places - centre, axis=1) < radius
+    values = (
+        rms(distance),
+        rms(distance[~in_hole]),
+        rms(distance[in_hole]),
+        np.percentile(distance, 95),
+        distance.max(),
+        np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean(),
+    )
+    return Errors(*(float(value) for value in values))
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def sample(mesh: Trimesh, n: int, rng: np.random.Generator) -> Samples:
+    """`n` points uniform by area."""
+    face = rng.choice(len(mesh.faces), n, p=mesh.area_faces / mesh.area_faces.sum())
+    u, v = rng.uniform(size=(2, n))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    weights = np.stack([1 - u - v, u, v], axis=1)[:, :, None]
+    points, normals = (np.sum(of[mesh.faces[face]] * weights, axis=1) for of in (mesh.vertices, mesh.vertex_normals))
+    return Samples(points, directions(normals))
+
+
+def nearest(mesh: Trimesh, points: Float[np.ndarray, "p 3"]) -> Samples:
+    """The exactly closest points of the triangles; by VTK, so that no method is its own judge."""
+    import pyvista
+
+    face, on = pyvista.make_tri_mesh(mesh.vertices, mesh.faces).find_closest_cell(points, return_closest_point=True)
+    weights = np.nan_to_num(trimesh.triangles.points_to_barycentric(mesh.triangles[face], on))  # slivers have no area
+    return Samples(on, directions(np.sum(mesh.vertex_normals[mesh.faces[face]] * weights[:, :, None], axis=1)))
+
+
+def directions(rows: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+    return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
+
+
+# ---- methods: a problem to a surface of triangles
+
+
+def jaxsubdiv(problem: Problem, scheme: js.AbstractScheme, levels: int, **settings) -> Trimesh:
+    template = align(problem.template(TEMPLATE_VERTICES), problem.scan)
+    mesh = js.ControlMesh(template.vertices, template.faces, template.vertex_normals)
+    topology = js.build_topology(mesh, scheme, levels)
+    found = fitting.fit(scheme, topology, mesh.control(), fitting.Scan(problem.scan), throw=False, **settings)
+    return Trimesh(np.asarray(found.surface.vertices, np.float64), found.surface.triangles(), process=False)
+
+
+def open3d_poisson(problem: Problem) -> Trimesh:
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(problem.scan))
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(30))
+    cloud.normals = o3d.utility.Vector3dVector(outward(problem.scan, np.asarray(cloud.normals)))
+    mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=6)
+    return largest_part(np.asarray(mesh.vertices), np.asarray(mesh.triangles))
+
+
+def pymeshlab_poisson(problem: Problem) -> Trimesh:
+    import pymeshlab
+
+    meshes = pymeshlab.MeshSet(verbose=False)
+    meshes.add_mesh(pymeshlab.Mesh(problem.scan))
+    meshes.compute_normal_for_point_clouds(k=30)
+    normals = outward(problem.scan, meshes.current_mesh().vertex_normal_matrix())
+    meshes.add_mesh(pymeshlab.Mesh(problem.scan, v_normals_matrix=normals))
+    meshes.generate_surface_reconstruction_screened_poisson(depth=7, pointweight=0.1)
+    found = meshes.current_mesh()
+    return largest_part(found.vertex_matrix(), found.face_matrix())
+
+
+def nricp(problem: Problem) -> Trimesh:
+    template = align(problem.template(NRICP_VERTICES), problem.scan)
+    vertices = trimesh.registration.nricp_amberg(template, problem.scan)
+    return Trimesh(vertices, template.faces, process=False)
+
+
+def outward(scan: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+    """Normals turned away from the middle of the scan, which on a head is right nearly everywhere."""
+    away = np.sum((scan - np.median(scan, axis=0)) * normals, axis=1, keepdims=True)
+    return np.where(away < 0, -normals, normals)
+
+
+def largest_part(vertices: np.ndarray, faces: np.ndarray) -> Trimesh:
+    """Poisson closes islands around outliers too, which a person would delete."""
+    parts = Trimesh(vertices, faces, process=False).split(only_watertight=False)
+    return max(parts, key=lambda part: part.area)
+
+
+# To be removed for `fitting.align(control, scan, kind="similarity")` once there is one; nricp is given the same.
+def align(mesh: Trimesh, scan: Float[np.ndarray, "p 3"], keep: float = 0.4, iterations: int = 60) -> Trimesh:
+    """The mesh moved to the scan by a similarity: trimmed ICP, point to plane, over the part `keep` that is nearest."""
+    rng = np.random.default_rng(0)
+    points = rng.permutation(scan)[:3000]
+    x, n = sample(mesh, 10_000, rng)
+    vertices, normals = np.array(mesh.vertices), np.array(mesh.vertex_normals)
+    for _ in range(iterations):
+        distance, i = KDTree(x).query(points)
+        near = distance <= np.quantile(distance, keep)
+        i, gap = i[near], points[near] - x[i[near]]
+        centre = x[i].mean(axis=0)
+        arm = x[i] - centre
+        rows = np.column_stack([np.cross(arm, n[i]), np.sum(arm * n[i], axis=1), n[i]])
+        turn, grow, shift = np.split(np.linalg.lstsq(rows, np.sum(gap * n[i], axis=1))[0], [3, 4])
+        rotation = Rotation.from_rotvec(turn)
+        x, vertices = (np.exp(grow) * rotation.apply(rows - centre) + centre + shift for rows in (x, vertices))
+        n, normals = rotation.apply(n), rotation.apply(normals)
+    return Trimesh(vertices, mesh.faces, vertex_normals=normals, process=False)
+
+
+# Another method, a least-squares fit of a Loop surface say, is one more function and one more row here.
+METHODS: dict[str, Callable[[Problem], Trimesh]] = {
+    "jaxsubdiv-2": lambda problem: jaxsubdiv(problem, js.Interpolating(), 2),
+    "jaxsubdiv-3": lambda problem: jaxsubdiv(problem, js.Interpolating(), 3),
+    "open3d": open3d_poisson,
+    "pymeshlab": pymeshlab_poisson,
+    "nricp": nricp,
+}
+
+
+# ---- run
+
+
+def run(truth: Trimesh, cases: Sequence[str], methods: Sequence[str], seeds: Sequence[int]) -> list[dict]:
+    """A row a case, method and seed, told as it comes. One without numbers says why under `error`."""
+    rows = []
+    for name in cases:
+        problems = {seed: draw(truth, CASES[name], seed) for seed in seeds}
+        for method in methods:
+            for seed, (problem, centre) in problems.items():
+                row = {"case": name, "method": method, "seed": seed}
+                try:
+                    fitted, row["cpu_s"], row["wall_s"] = timed(METHODS[method], problem)
+                    errors = measure(fitted, truth, centre, CASES[name].hole, np.random.default_rng(seed))
+                    rows.append(row | errors._asdict())
+                except Exception as error:  # a method that fails or is missing must not take the others' numbers along
+                    rows.append(row | {"error": f"{type(error).__name__}: {error}"})
+                told = (
+                    f"{key} {value:.3g}" if isinstance(value, float) else f"{value}" for key, value in rows[-1].items()
+                )
+                print(*told, sep=", ", file=sys.stderr, flush=True)
+    return rows
+
+
+def timed(method: Callable[[Problem], Trimesh], problem: Problem) -> tuple[Trimesh, float, float]:
+    """What a method finds, its CPU and its wall seconds, compilation included; templates are made beforehand."""
+    for n_vertices in (TEMPLATE_VERTICES, NRICP_VERTICES):
+        problem.template(n_vertices)
+    wall, cpu = time.perf_counter(), time.process_time()
+    fitted = method(problem)
+    return fitted, time.process_time() - cpu, time.perf_counter() - wall
+
+
+HEADINGS = ("total", "where data", "in the hole", "p95", "Hausdorff", "normals, deg", "CPU s", "wall s")
+
+
+def table(rows: list[dict]) -> str:
+    """Markdown: means over the seeds; below, what there are no numbers for."""
+    lines = ["| case | method | seeds | " + " | ".join(HEADINGS) + " |", "|---|---|" + "--:|" * 9]
+    for case, method in dict.fromkeys((row["case"], row["method"]) for row in rows if "error" not in row):
+        of = [row for row in rows if (row["case"], row["method"]) == (case, method) and "error" not in row]
+        means = (f"{np.mean([row[key] for row in of]):.3g}" for key in (*Errors._fields, "cpu_s", "wall_s"))
+        lines.append(f"| {case} | {method} | {len(of)} | " + " | ".join(means) + " |")
+    without = dict.fromkeys(f"{row['method']}: {row['error']}" for row in rows if "error" in row)
+    return "\n".join([*lines, *(f"\nSkipped, {why}" for why in without)])
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("--data", type=Path, default=DATA, help=f"folder that holds {HEAD} (default: {DATA})")
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), metavar="CASE", help=", ".join(CASES))
+    parser.add_argument(
+        "--methods", nargs="+", choices=METHODS, default=list(METHODS), metavar="METHOD", help=", ".join(METHODS)
+    )
+    parser.add_argument("--seeds", nargs="+", type=int, default=range(5), metavar="SEED", help="default: 0 1 2 3 4")
+    parser.add_argument("--output", type=Path, default=Path("fit_protocol.json"), help="default: %(default)s")
+    options = parser.parse_args(arguments)
+    if not (options.data / HEAD).is_file():
+        print(f"error: {options.data / HEAD} is not there. The head is not shipped: name its folder with --data.")
+        return 2
+    truth = trimesh.load_mesh(options.data / HEAD, process=False)
+    rows = run(truth, options.cases, options.methods, options.seeds)
+    versions = {found.name: found.version for found in distributions() if found.name in VERSIONS}
+    options.output.write_text(json.dumps({"versions": versions, "rows": rows}, indent=2) + "\n", encoding="utf-8")
+    print(table(rows))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

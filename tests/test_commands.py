@@ -1,0 +1,303 @@
+"""Both command lines, run in this process: what they write and print, and what they refuse."""
+
+import json
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import meshes
+import numpy as np
+import pytest
+from scans import noise, problem
+from schemes import refine_eagerly
+
+import jaxsubdiv as js
+from fitting.__main__ import main as fit
+from jaxsubdiv.__main__ import main as refine
+
+pytestmark = pytest.mark.usefixtures("command_settings")
+
+VERTICES, FACES = meshes.pyramid()
+NORMALS = np.random.default_rng(1).normal(scale=0.3, size=VERTICES.shape) + VERTICES
+
+
+@pytest.fixture
+def pyramid(tmp_path) -> Path:
+    """Four triangles and a quad, with normals that are not those of the faces."""
+    js.write_mesh(tmp_path / "in.obj", js.ControlMesh(VERTICES, FACES, NORMALS))
+    return tmp_path / "in.obj"
+
+
+def run(command, *arguments) -> int:
+    return command([str(argument) for argument in arguments])
+
+
+# jaxsubdiv
+
+
+REFINEMENTS = {
+    "default": ("", js.Interpolating(), {}),
+    "h": ("--h 0.6", js.Interpolating(0.6), {}),
+    "h, one a level": ("--h 1.2 0.7", js.Interpolating([1.2, 0.7]), {}),
+    "twist": ("--twist printed", js.Interpolating(twist="printed"), {}),
+    "weights": ("--weights angle --ignore-normals", js.Interpolating(weights="angle"), {"ignore_normals": True}),
+    "old normals": ("--old-normals recompute", js.Interpolating(old_normals="recompute"), {}),
+    "boundary": ("--boundary chord", js.Interpolating(boundary="chord"), {}),
+    "circle": ("--scheme circle", js.CirclePreserving(), {}),
+    "circle and h": ("--scheme circle --h 0.9", js.CirclePreserving(0.9), {}),
+    "circle, computed normals": ("--scheme circle --ignore-normals", js.CirclePreserving(), {"ignore_normals": True}),
+    "ignore normals": ("--ignore-normals", js.Interpolating(), {"ignore_normals": True}),
+    "mesh normals": ("--normals-out mesh", js.Interpolating(), {"mesh_normals": True}),
+    "scale": ("--scale 1000", js.Interpolating(), {"scale": 1000}),
+    "all": (
+        "--h 1.2 0.7 --twist printed --weights uniform --old-normals recompute --boundary chord --normals-out mesh",
+        js.Interpolating([1.2, 0.7], twist="printed", weights="uniform", old_normals="recompute", boundary="chord"),
+        {"mesh_normals": True},
+    ),
+}
+
+
+def open_pyramid() -> meshes.Mesh:
+    """A quad and three triangles: a boundary too, for the rules there."""
+    return VERTICES, FACES[:-1]
+
+
+def expected(scheme, ignore_normals=False, mesh_normals=False, scale=1.0) -> js.RefinedSurface:
+    vertices, faces = open_pyramid()
+    mesh = js.ControlMesh(vertices * scale, faces, None if ignore_normals else NORMALS)
+    topology = js.build_topology(mesh, scheme, 2, mesh_normals=mesh_normals)
+    return refine_eagerly(scheme, topology, mesh.control(weights=scheme.weights))
+
+
+@pytest.fixture
+def eager(monkeypatch):
+    """The same operations one by one, which are compiled once for all options."""
+    monkeypatch.setattr("jaxsubdiv.__main__.refine", refine_eagerly)
+
+
+@pytest.mark.parametrize("name", REFINEMENTS)
+def test_options_are_those_of_the_library(tmp_path, eager, name):
+    js.write_mesh(tmp_path / "in.obj", js.ControlMesh(*open_pyramid(), NORMALS))
+    options, scheme, how = REFINEMENTS[name]
+    assert run(refine, tmp_path / "in.obj", tmp_path / "out.ply", "--levels", 2, *options.split()) == 0
+    written, surface = js.read_mesh(tmp_path / "out.ply"), expected(scheme, **how)
+    np.testing.assert_allclose(written.vertices, surface.vertices, rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(written.normals, surface.normals, rtol=1e-14, atol=1e-14)
+    for size in (3, 4):
+        np.testing.assert_array_equal(written.faces[size], surface.faces[size])
+    plain = expected(js.Interpolating())
+    changed = [np.abs(getattr(surface, part) - getattr(plain, part)).max() for part in ("vertices", "normals")]
+    assert (max(changed) > 1e-3) == (name != "default")  # or the option would not have been tested
+
+
+def test_three_levels_unless_told_otherwise(tmp_path, pyramid, capsys):
+    assert run(refine, pyramid, tmp_path / "out.ply") == 0
+    out, err = capsys.readouterr()
+    assert out.splitlines() == [
+        f"read     {pyramid}: 5 vertices, 4 triangles, 1 quads, closed, Euler number 2, normals given",
+        f"wrote    {tmp_path / 'out.ply'}: 162 vertices, 256 triangles, 64 quads",
+    ]
+    assert err == ""
+    mesh = js.read_mesh(tmp_path / "out.ply")
+    assert (len(mesh.vertices), len(mesh.faces[3]), len(mesh.faces[4])) == (162, 256, 64)
+
+
+def test_no_levels_write_the_input_again(tmp_path, pyramid):
+    assert run(refine, pyramid, tmp_path / "out.obj", "--levels", 0) == 0
+    np.testing.assert_array_equal(js.read_mesh(tmp_path / "out.obj").vertices, VERTICES)
+
+
+def test_repairs_are_told_and_done(tmp_path, capsys):
+    doubled = "".join(f"v {x} {y} {z}\n" for x, y, z in [*VERTICES, VERTICES[0]])
+    (tmp_path / "in.obj").write_text(doubled + "f 6 2 5\nf 2 3 5\nf 3 4 5\nf 4 1 5\nf 4 3 2 1\nf 1 1 2\n")
+    refused = run(refine, tmp_path / "in.obj", tmp_path / "out.obj", "--levels", 0)
+    assert refused == 2 and not (tmp_path / "out.obj").exists()
+    capsys.readouterr()
+    assert run(refine, tmp_path / "in.obj", tmp_path / "out.obj", "--levels", 0, "--repair") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert sum(line.startswith("repaired: ") for line in lines) >= 2 and "5 vertices" in "".join(lines[-2:])
+    assert js.read_mesh(tmp_path / "out.obj").is_closed
+
+
+def test_sound_mesh_needs_no_repair(tmp_path, pyramid, capsys):
+    assert run(refine, pyramid, tmp_path / "out.obj", "--levels", 0, "--repair") == 0
+    assert "repaired" not in capsys.readouterr().out
+
+
+def test_warnings_are_plain_words_on_stderr(tmp_path, pyramid, capsys):
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        assert run(refine, pyramid, tmp_path / "out.stl", "--levels", 0) == 0
+    assert capsys.readouterr().err == (
+        "warning: out.stl: STL holds triangles only: 1 quads were split in two along their first diagonal.\n"
+    )
+
+
+REFUSED = {
+    "no such file": ("none.obj out.ply", r"none.obj"),
+    "not a mesh": ("text.obj out.ply", r"text.obj"),
+    "unknown format": ("in.obj out.xyz", r".xyz"),
+    "no such folder": ("in.obj none/out.ply", r"none"),
+    "levels": ("in.obj out.ply --levels 9", "`levels` must lie between 0 and 8; got 9."),
+    "h": ("in.obj out.ply --levels 3 --h 1 1", "`h` must be a scalar or have the shape [3]; got [2]."),
+    "circle with an option": (
+        "in.obj out.ply --scheme circle --weights area --old-normals keep",
+        "--weights, --old-normals: only the scheme 'interpolating' has this choice.",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_used_is_status_2_with_words_and_without_a_file(tmp_path, pyramid, capsys, monkeypatch, name):
+    arguments, words = REFUSED[name]
+    (tmp_path / "text.obj").write_text("hello\n")
+    (tmp_path / "out.ply").write_text("an older file")
+    monkeypatch.chdir(tmp_path)
+    files = sorted(tmp_path.iterdir())
+    assert run(refine, *arguments.split()) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("error: ") and words in err and "Traceback" not in err
+    assert sorted(tmp_path.iterdir()) == files and (tmp_path / "out.ply").read_text() == "an older file"
+
+
+@pytest.mark.parametrize(
+    "arguments", ["", "in.obj", "in.obj out.ply --scheme loop", "in.obj out.ply --levels x", "in.obj out.ply --twist 0"]
+)
+def test_misspelt_arguments_are_status_2_with_the_usage(capsys, arguments):
+    with pytest.raises(SystemExit) as caught:
+        run(refine, *arguments.split())
+    assert caught.value.code == 2 and "usage: jaxsubdiv" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("command", "name"), [(refine, "jaxsubdiv"), (fit, "jaxsubdiv-fit")])
+def test_help_names_every_option(capsys, command, name):
+    with pytest.raises(SystemExit) as caught:
+        command(["--help"])
+    out = capsys.readouterr().out
+    assert caught.value.code == 0 and out.startswith(f"usage: {name} ")
+    assert "--levels" in out and "--scheme" in out and "Exit status" in out
+
+
+@pytest.mark.parametrize("package", ["jaxsubdiv", "fitting"])
+def test_runs_as_a_module(package):
+    done = subprocess.run([sys.executable, "-m", package, "--help"], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and done.stdout.startswith("usage: ") and done.stderr == ""
+
+
+# jaxsubdiv-fit
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch) -> Path:
+    """A scan and a control mesh as files, in the folder that the command runs in."""
+    p = problem()
+    np.savetxt(tmp_path / "scan.xyz", p.points + noise(), fmt="%.17g")
+    np.savetxt(tmp_path / "metres.xyz", (p.points + noise()) / 1000, fmt="%.17g")
+    start = js.ControlMesh(p.start.vertices, p.mesh.faces, p.start.normals)
+    js.write_mesh(tmp_path / "control.obj", start)
+    js.write_mesh(tmp_path / "centimetres.obj", js.ControlMesh(start.vertices / 10, start.faces, start.normals))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+RESULTS = ["control.obj", "fit.png", "report.json", "surface.ply"]
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_fit_of_files_is_that_of_the_library(files, capsys):
+    assert run(fit, "scan.xyz", "--control", "control.obj", "--levels", 1, "-o", "deep/folder") == 0
+    found, out = problem().fit(problem().points + noise()), capsys.readouterr().out
+    assert "scan     600 points, " in out and "control  12 vertices, 14 faces, " in out
+    assert (
+        str(found.report()) in out and "wrote    control.obj, surface.ply, report.json, fit.png in deep/folder" in out
+    )
+    assert names(files / "deep" / "folder") == RESULTS
+    control = js.read_mesh("deep/folder/control.obj")
+    np.testing.assert_allclose(control.vertices, found.control.vertices, rtol=1e-9)
+    np.testing.assert_allclose(control.normals, found.control.normals, rtol=1e-9, atol=1e-12)
+    surface = js.read_mesh("deep/folder/surface.ply")
+    np.testing.assert_allclose(surface.vertices, found.surface.vertices, rtol=1e-9, atol=1e-9)
+    assert json.loads(Path("deep/folder/report.json").read_text()) == found.report().as_dict()
+
+
+def test_fit_that_did_not_converge_is_status_1_and_written_all_the_same(files, capsys):
+    assert run(fit, "scan.xyz", "--control", "control.obj", "--levels", 1, "--max-sweeps", 2) == 1
+    assert "NOT CONVERGED" in capsys.readouterr().out
+    assert names(files / "fit_scan") == RESULTS
+    assert json.loads((files / "fit_scan" / "report.json").read_text())["converged"] is False
+
+
+def test_scales_bring_both_files_to_mm(files):
+    options = ("--levels", 1, "--max-sweeps", 1)
+    assert run(fit, "scan.xyz", "--control", "control.obj", "-o", "a", *options) == 1
+    scaled = ("metres.xyz", "--scale", 1000, "--control", "centimetres.obj", "--control-scale", 10)
+    assert run(fit, *scaled, "-o", "b", *options) == 1
+    a, b = (js.read_mesh(f"{folder}/control.obj").vertices for folder in "ab")
+    np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+def test_without_matplotlib_there_is_no_picture_but_all_the_rest(files, capsys, monkeypatch):
+    for module in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
+        monkeypatch.setitem(sys.modules, module, None)
+    assert run(fit, "scan.xyz", "--control", "control.obj", "--levels", 1, "--max-sweeps", 1, "-o", "out") == 1
+    assert names(files / "out") == ["control.obj", "report.json", "surface.ply"]
+    assert "note     no picture: " in capsys.readouterr().out
+
+
+def test_without_tqdm_every_sweep_is_a_line(files, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tqdm", None)
+    assert run(fit, "scan.xyz", "--control", "control.obj", "--levels", 1, "--max-sweeps", 2, "-o", "out") == 1
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("sweep")]
+    assert [line[:9] for line in lines] == ["sweep   1", "sweep   2"]
+
+
+def test_far_start_is_a_warning_in_plain_words(files, capsys):
+    np.savetxt("off.xyz", problem().points + (25, 0, 0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        assert run(fit, "off.xyz", "--control", "control.obj", "--levels", 1, "--max-sweeps", 0) == 1
+    assert "\nwarning: half of the scan lies over " in "\n" + capsys.readouterr().err
+
+
+FIT_REFUSED = {
+    "no such scan": ("none.xyz --control control.obj", "none.xyz"),
+    "scan that is no numbers": ("text.xyz --control control.obj", "text.xyz, line 1"),
+    "no such control mesh": ("scan.xyz --control none.obj", "none.obj"),
+    "no levels": ("scan.xyz --control control.obj --levels 0", "a topology of one level or more"),
+    "scan in metres": ("metres.xyz --control control.obj --levels 1", "their units differ"),
+    "too few points": ("few.xyz --control control.obj --levels 1", "the scan has 2 points for 12 control vertices"),
+}
+
+
+@pytest.mark.parametrize("name", FIT_REFUSED)
+def test_fit_of_what_cannot_be_used_is_status_2_with_words_and_without_files(files, capsys, name):
+    arguments, words = FIT_REFUSED[name]
+    Path("text.xyz").write_text("hello world\n")
+    Path("few.xyz").write_text("1 2 3\n4 5 6\n")
+    before = names(files)
+    assert run(fit, *arguments.split()) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("error: ") and words in err and "Traceback" not in err
+    assert names(files) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("scan.xyz", "give SCAN and --control MESH"),
+        ("--control control.obj", "give SCAN and --control MESH"),
+        ("--example head", "invalid choice: 'head'"),
+        ("scan.xyz --control control.obj --scheme loop", "invalid choice: 'loop'"),
+    ],
+)
+def test_misspelt_arguments_of_a_fit_are_status_2_with_the_usage(files, capsys, arguments, words):
+    before = names(files)
+    with pytest.raises(SystemExit) as caught:
+        run(fit, *arguments.split())
+    err = capsys.readouterr().err
+    assert caught.value.code == 2 and "usage: jaxsubdiv-fit" in err and words in err
+    assert names(files) == before

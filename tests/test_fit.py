@@ -1,0 +1,606 @@
+"""Fits: what a sweep makes small, what a fit finds again, what it ignores, and how it says that it failed."""
+
+import dataclasses
+import functools
+import json
+import re
+
+import jax
+import jax.numpy as jnp
+import meshes
+import meshio
+import numpy as np
+import optimistix as optx
+import pytest
+from scans import N_POINTS, SIGMA, noise, problem
+from schemes import control_mesh
+
+import fitting
+import jaxsubdiv as js
+from fitting import Free, Priors, Scan, ScanError, _fit
+from fitting.__main__ import main as fitting_command
+from fitting._free import Unknowns, apply_offset, no_offset, tangents
+from fitting._residuals import Correspondence, Start, bend_asymmetry, residuals
+
+NO_PRIORS = Priors(fairness=0.0, fairness_start=0.0, h=0.0)
+CONVERGED, NONFINITE = optx.RESULTS.successful, optx.RESULTS.nonfinite
+
+
+def rms(values) -> float:
+    return float(np.sqrt(np.mean(np.asarray(values) ** 2)))
+
+
+# The prior on the shape
+
+
+def on_shape(shape: str, levels: int = 2) -> tuple[js.Topology, js.RefinedSurface]:
+    """A sheet bent onto a shape, with the normals of the shape, refined vertices too."""
+    mesh = control_mesh(meshes.grid(3, 2, "mixed"))
+    topology, flat = js.build_topology(mesh, js.Interpolating(), levels), mesh.vertices
+    for level in topology.levels:
+        flat = np.concatenate(
+            [flat, flat[np.asarray(level.edges)].mean(axis=1), flat[np.asarray(level.quads)].mean(axis=1)]
+        )
+    x, y, _ = flat.T / 3
+    ball = np.stack([np.cos(x) * np.cos(y), np.sin(x) * np.cos(y), np.sin(y)], axis=1)
+    vertices, normals = {
+        "plane": (np.stack([x, y, 2 * x - y], axis=1), np.tile([-2, 1, 1], (len(x), 1)) / 6**0.5),
+        "cylinder": (np.stack([7 * np.cos(x), 7 * np.sin(x), 20 * y], axis=1), ball * (1, 1, 0) / np.cos(y)[:, None]),
+        "sphere": (30 * ball + (5, 6, 7), ball),
+        "inside of a sphere": (30 * ball, -ball),
+        "ellipsoid": (ball * (3, 2, 1), ball / (3, 2, 1) / np.linalg.norm(ball / (3, 2, 1), axis=1, keepdims=True)),
+    }[shape]
+    return topology, js.RefinedSurface(jnp.asarray(vertices), jnp.asarray(normals), topology.faces)
+
+
+@pytest.mark.parametrize("shape", ["plane", "cylinder", "sphere", "inside of a sphere"])
+def test_bend_asymmetry_is_zero_where_every_edge_is_a_circular_arc_or_straight(shape):
+    for level in bend_asymmetry(*on_shape(shape)):
+        np.testing.assert_allclose(level, 0, atol=1e-13)
+
+
+def test_bend_asymmetry_sees_a_bend_that_changes():
+    control_edges, finer_edges = bend_asymmetry(*on_shape("ellipsoid"))
+    # It goes with the third power of the edge, and the finer edges are half as long.
+    assert rms(control_edges) > 0.01 and 4 < rms(control_edges) / rms(finer_edges) < 16
+
+
+def test_bend_asymmetry_sees_a_normal_that_leans():
+    topology, surface = on_shape("plane")
+    leaning = np.asarray(surface.normals).copy()
+    leaning[5] = (0, 0, 1)
+    surface = js.RefinedSurface(surface.vertices, jnp.asarray(leaning), surface.faces)
+    for edges, found in zip((level.edges for level in topology.levels), bend_asymmetry(topology, surface), strict=True):
+        a, b = np.asarray(surface.vertices)[np.asarray(edges)].swapaxes(0, 1)
+        at_leaning = (np.asarray(edges) == 5).any(axis=1)
+        np.testing.assert_allclose(found[:, 0], np.where(at_leaning, (b - a)[:, 2] / 2, 0), atol=1e-13)
+        assert np.abs(found[at_leaning]).max() > 0.05
+
+
+@pytest.mark.parametrize(("levels", "n_terms"), [(1, 1), (2, 2), (3, 2)])
+def test_bend_asymmetry_is_taken_over_the_two_coarsest_levels(levels, n_terms):
+    topology, surface = on_shape("ellipsoid", levels)
+    assert [len(term) for term in bend_asymmetry(topology, surface)] == [
+        len(level.edges) for level in topology.levels[:n_terms]
+    ]
+
+
+def test_fairness_halves_from_sweep_to_sweep_down_to_its_last_value():
+    priors = Priors(fairness=0.1, fairness_start=1.0)
+    np.testing.assert_allclose([priors.fairness_in(i) for i in range(6)], [1, 0.5, 0.25, 0.125, 0.1, 0.1])
+    assert Priors(fairness=2.0).fairness_in(0) == 2
+
+
+# Residuals
+
+
+def one_triangle(h: float, lean: float) -> tuple[js.Interpolating, js.Topology, js.Control]:
+    """A flat triangle of sides 3, 4 and 5 mm; the normal at its first corner leans along the side of 3."""
+    mesh = js.ControlMesh([(0, 0, 0), (3, 0, 0), (0, 4, 0)], [(0, 1, 2)])
+    normals = np.array([(np.sin(lean), 0, np.cos(lean)), (0, 0, 1), (0, 0, 1)])
+    return js.Interpolating(h), js.build_topology(mesh, js.Interpolating(), 1), js.Control(mesh.vertices, normals)
+
+
+def start_of(scheme, topology, control, fairness: float = 0.2) -> Start:
+    """Two points: one over the middle of the triangle, one beside its second corner, where the surface ends."""
+    pairs = Correspondence(
+        points=jnp.array([(1.0, 1.0, 5.0), (3.5, 0.0, 0.25)]),
+        corners=jnp.array([(0, 1, 2, 2), (1, 1, 2, 2)]),
+        corner_weights=jnp.array([(0.5, 0.25, 0.25, 0.0), (1.0, 0.0, 0.0, 0.0)]),
+        normals=jnp.array([(0.0, 0.0, 1.0), (0.0, 0.0, 1.0)]),
+        weights=jnp.array([1.6, 0.4]),
+        at_boundary=jnp.array([False, True]),
+    )
+    priors = Priors(h=0.3, along=0.05)
+    return Start(scheme, topology, control, pairs, priors, jnp.asarray(fairness))
+
+
+@functools.cache
+def compiled():
+    """The residuals, stacked, with their derivative along a direction and that of their product with given weights."""
+
+    def stacked(offset: Unknowns, start: Start) -> jax.Array:
+        return jnp.concatenate([rows.ravel() for rows in residuals(offset, start)])
+
+    @jax.jit
+    def all_of(offset, start, along, given):
+        value, tangent = jax.jvp(lambda at: stacked(at, start), (offset,), (along,))
+        return value, tangent, jax.vjp(lambda at: stacked(at, start), offset)[1](given)[0]
+
+    return all_of
+
+
+def random_offset(start: Start, seed: int) -> Unknowns:
+    rng = np.random.default_rng(seed)
+    zero = no_offset(Free(), start.scheme, start.control)
+    return jax.tree.map(lambda x: jnp.asarray(rng.normal(scale=0.1, size=x.shape)), zero)
+
+
+GIVEN = np.random.default_rng(5).normal(size=2 + 6 + 3 + 1)
+"""Weights of the residuals of `start_of`: two points across and along, three edges, and h."""
+
+
+def test_residuals_are_those_worked_out_by_hand():
+    start = start_of(*one_triangle(h=1.5, lean=0.2))
+    offset = no_offset(Free(), start.scheme, start.control)
+    value, _, _ = compiled()(offset, start, offset, GIVEN)
+    across, along, bend, stretch = np.split(value, [2, 8, 11])
+    scale = 3 / 0.01  # control vertices over the damping
+    away = np.array([(-0.25, 0, -5), (-0.5, 0, -0.25)])
+    root = np.sqrt([[1.6], [0.4]])
+    np.testing.assert_allclose(across, (root * away * np.sqrt(scale / 2))[:, 2], rtol=1e-12)
+    np.testing.assert_allclose(along, (root * away * np.sqrt([[0.05], [1]]) * np.sqrt(scale / 2)).ravel(), rtol=1e-12)
+    # Only the side of 3 leaves the first corner along the lean: 3 sin(lean) / 2.
+    by_hand = [0, 0, 1.5 * np.sin(0.2) * np.sqrt(0.2 * scale / 3)]
+    np.testing.assert_allclose(np.sort(np.abs(bend)), by_hand, rtol=1e-12, atol=1e-12)
+    length = np.sqrt((9 + 16 + 25) / 3)
+    np.testing.assert_allclose(stretch, [0.1 * length * 0.5 * np.sqrt(0.3 * scale)], rtol=1e-12)
+
+
+def test_derivatives_of_the_residuals_agree_with_differences():
+    start = start_of(*one_triangle(h=1.1, lean=0.2))
+    at, along = random_offset(start, 0), random_offset(start, 1)
+    _, tangent, gradient = compiled()(at, start, along, GIVEN)
+    steps = (jax.tree.map(lambda x, dx, step=step: x + step * dx, at, along) for step in (1e-5, -1e-5))
+    ahead, back = (compiled()(moved, start, along, GIVEN)[0] for moved in steps)
+    np.testing.assert_allclose(tangent, (ahead - back) / 2e-5, rtol=1e-6, atol=1e-6)
+    reverse = sum(jax.tree.leaves(jax.tree.map(jnp.vdot, gradient, along)))
+    np.testing.assert_allclose(reverse, GIVEN @ tangent, rtol=1e-11)
+
+
+def test_residuals_have_finite_derivatives_at_a_perfect_fit():
+    start = start_of(*one_triangle(h=1.0, lean=0.0))
+    on = jnp.array([(0.75, 1.0, 0.0), (3.0, 0.0, 0.0)])
+    start = start._replace(pairs=start.pairs._replace(points=on))
+    offset = no_offset(Free(), start.scheme, start.control)
+    value, _, gradient = compiled()(offset, start, offset, GIVEN)
+    assert np.allclose(value, 0)
+    assert all(np.isfinite(rows).all() and np.any(rows) for rows in jax.tree.leaves(gradient))
+
+
+# Unknowns
+
+
+def test_tangents_are_orthonormal_and_turn_to_the_normal():
+    n = np.random.default_rng(0).normal(size=(50, 3))
+    n = np.concatenate([np.eye(3), -np.eye(3), n / np.linalg.norm(n, axis=1, keepdims=True), [[0.5**0.5, 0.5**0.5, 0]]])
+    first, second = tangents(jnp.asarray(n))
+    frames = np.stack([n, first, second], axis=1)
+    np.testing.assert_allclose(frames @ frames.swapaxes(1, 2), np.tile(np.eye(3), (len(n), 1, 1)), atol=1e-14)
+    np.testing.assert_allclose(np.linalg.det(frames), 1, atol=1e-14)
+
+
+@pytest.mark.parametrize("h", [1.2, [1.2, 0.7]])
+def test_offset_of_zero_changes_nothing(h):
+    p, scheme = problem(), js.Interpolating(h)
+    unit = js.Control(p.start.vertices, p.start.normals / np.linalg.norm(p.start.normals, axis=1, keepdims=True))
+    found, control = apply_offset(p.topology, scheme, unit, no_offset(Free(), scheme, unit))
+    np.testing.assert_array_equal(control.vertices, unit.vertices)
+    np.testing.assert_allclose(control.normals, unit.normals, rtol=0, atol=4e-16)
+    np.testing.assert_array_equal(found.h, scheme.h)
+
+
+@pytest.mark.parametrize("size", [0.01, 1, 1e6])
+def test_offset_leaves_normals_unit(size):
+    p, scheme = problem(), js.Interpolating()
+    rng = np.random.default_rng(0)
+    offset = jax.tree.map(lambda x: jnp.asarray(size * rng.normal(size=x.shape)), no_offset(Free(), scheme, p.start))
+    _, control = apply_offset(p.topology, scheme, p.start, offset)
+    np.testing.assert_allclose(np.linalg.norm(control.normals, axis=1), 1, atol=1e-14)
+
+
+@pytest.mark.parametrize("free", [Free(True, False, False), Free(False, True, False), Free(False, False, True)])
+def test_offset_of_one_moves_the_surface_by_about_a_millimetre(free):
+    p, scheme, small = problem(), js.Interpolating(), 1e-3
+    offset = jax.tree.map(lambda x: jnp.full_like(x, small), no_offset(free, scheme, p.start))
+    moved_scheme, moved_control = apply_offset(p.topology, scheme, p.start, offset)
+    before = js.refine(scheme, p.topology, p.start)
+    after = js.refine(moved_scheme, p.topology, moved_control)
+    moved = np.linalg.norm(after.vertices - before.vertices, axis=1) / small
+    assert 0.3 < moved.max() < 3
+
+
+def test_nothing_free_is_refused():
+    with pytest.raises(ValueError, match="nothing is free: let at least one of vertices, normals and h be True"):
+        Free(False, False, False)
+
+
+# Fits of one surface that is known
+
+
+@pytest.fixture(scope="module")
+def noisy() -> fitting.FitResult:
+    return problem().fit(problem().points + noise())
+
+
+def to_truth(result: fitting.FitResult) -> float:
+    """RMS distance of the fitted surface from the points without their noise."""
+    points = problem().points
+    at = fitting.closest_points(result.surface, points)
+    return rms(np.linalg.norm(js.evaluate(result.surface, at).points - points, axis=1))
+
+
+def test_exact_scan_of_a_refined_surface_is_met_and_its_control_mesh_found():
+    p, priors = problem(), Priors(fairness=0.0, fairness_start=0.0, h=0.0, along=0.1)
+    found = p.fit(priors=priors, loss=fitting.LeastSquares(), tolerance=0.0, max_sweeps=150)
+    assert found.rms[0] > 0.7 and found.rms[-1] < 3e-3
+    np.testing.assert_allclose(found.scheme.h, p.h, atol=1e-3)
+    np.testing.assert_allclose(found.control.vertices, p.truth.vertices, atol=0.2)
+    np.testing.assert_allclose(found.control.normals, p.truth.normals, atol=0.01)
+
+
+def test_noise_of_the_scan_is_smoothed(noisy):
+    assert noisy.result == CONVERGED
+    np.testing.assert_allclose(noisy.rms[-1], SIGMA, rtol=0.15)
+    assert to_truth(noisy) < 0.6 * SIGMA
+
+
+def test_result_is_consistent(noisy):
+    scan = problem().points + noise()
+    np.testing.assert_array_equal(noisy.scan.points, scan)
+    surface = js.refine(noisy.scheme, problem().topology, noisy.control)
+    np.testing.assert_array_equal(noisy.surface.vertices, surface.vertices)
+    np.testing.assert_array_equal(noisy.at.face, fitting.closest_points(surface, scan).face)
+    on, normals = js.evaluate(noisy.surface, noisy.at)
+    np.testing.assert_allclose(np.abs(noisy.distances), np.linalg.norm(scan - on, axis=1), rtol=1e-12)
+    np.testing.assert_array_equal(noisy.distances > 0, np.sum((scan - on) * normals, axis=1) > 0)
+    np.testing.assert_allclose(noisy.rms[-1], rms(noisy.distances), rtol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(noisy.control.normals, axis=1), 1, atol=1e-14)
+
+
+def test_points_outside_have_positive_distances():
+    p = problem()
+    for factor, sign in ((1.02, 1), (0.98, -1)):
+        found = p.fit(p.points * factor, control=p.truth, scheme=js.Interpolating(p.h), max_sweeps=0)
+        assert np.all(sign * found.distances > 0)
+
+
+def test_same_fit_twice_is_the_same_bit_for_bit(noisy):
+    again = problem().fit(problem().points + noise())
+    np.testing.assert_array_equal(again.control.vertices, noisy.control.vertices)
+    np.testing.assert_array_equal(again.rms, noisy.rms)
+
+
+def test_points_without_weight_have_no_influence():
+    scan, weights = problem().points + noise(), np.ones(N_POINTS)
+    weights[::5] = 0
+    elsewhere = scan.copy()
+    elsewhere[::5] *= 1.05
+    a, b = (problem().fit(points, weights=weights) for points in (scan, elsewhere))
+    for one, other in zip(jax.tree.leaves((a.control, a.scheme)), jax.tree.leaves((b.control, b.scheme)), strict=True):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(a.rms, b.rms)
+    assert not np.any(a.weights[::5])
+    everywhere = problem().fit(elsewhere)
+    assert np.abs(everywhere.control.vertices - b.control.vertices).max() > 0.05
+
+
+def test_heavier_points_are_met_more_closely():
+    p, heavy = problem(), np.arange(N_POINTS) % 2 == 1
+    away = p.points / np.linalg.norm(p.points, axis=1, keepdims=True)
+    scan = p.points + np.where(heavy, 0.2, -0.2)[:, None] * away
+    even, uneven = (p.fit(scan, weights=weights) for weights in (None, np.where(heavy, 20.0, 1.0)))
+    assert abs(even.distances.mean()) < 0.03
+    assert even.distances[heavy].mean() > 0.12 > 0.06 > uneven.distances[heavy].mean()
+
+
+def outliers() -> np.ndarray:
+    """A noisy scan, a tenth of it off by several millimetres to one side."""
+    points = problem().points + noise()
+    points[::10] += np.random.default_rng(2).uniform(3, 6, (N_POINTS // 10, 3))
+    return points
+
+
+def test_outliers_lose_weight_and_pull():
+    found = problem().fit(outliers())
+    far = np.abs(found.distances) > 3
+    assert 20 < far.sum() < 70
+    assert found.weights[far].max() < 0.35 < 0.8 < found.weights[np.abs(found.distances) < SIGMA].min()
+    assert to_truth(found) < SIGMA
+
+
+def test_control_vertices_without_normals_get_them():
+    p = problem()
+    normals = np.array(p.start.normals)
+    normals[[0, 7]] = 0
+    found = p.fit(p.points, control=js.Control(p.start.vertices, normals))
+    np.testing.assert_allclose(np.linalg.norm(found.control.normals, axis=1), 1, atol=1e-14)
+    np.testing.assert_allclose(found.control.normals, p.truth.normals, atol=0.1)
+
+
+def test_control_normals_of_any_length_serve(noisy):
+    p = problem()
+    double = js.Control(p.start.vertices, 2 * p.start.normals)
+    np.testing.assert_array_equal(p.fit(p.points + noise(), control=double).rms, noisy.rms)
+
+
+def test_every_sweep_is_told():
+    told = []
+    found = problem().fit(problem().points + noise(), on_sweep=told.append)
+    assert [sweep.number for sweep in told] == list(range(1, len(found.rms)))
+    assert [sweep.rms for sweep in told] == found.robust_rms[1:].tolist()
+
+
+def test_perfect_start_stays_finite():
+    p = problem()
+    scan = np.resize(np.asarray(js.refine(js.Interpolating(), p.topology, p.truth).vertices), (N_POINTS, 3))
+    found = p.fit(scan, control=p.truth, priors=NO_PRIORS)
+    assert found.result == CONVERGED and found.rms[-1] < 1e-6
+
+
+# Fits that fail
+
+
+def test_too_few_sweeps_are_an_error_in_words():
+    with pytest.raises(RuntimeError, match=r"did not converge in 2 sweeps \(RMS 0\.\d+ -> 0\.\d+ mm\): .*`max_sweeps`"):
+        problem().fit(max_sweeps=2, throw=True)
+
+
+@pytest.mark.parametrize("max_sweeps", [0, 2])
+def test_too_few_sweeps_are_a_result_where_nothing_is_thrown(max_sweeps):
+    found = problem().fit(max_sweeps=max_sweeps)
+    assert found.result == optx.RESULTS.nonlinear_max_steps_reached
+    assert len(found.rms) == max_sweeps + 1
+
+
+def broken_from(sweep: int, monkeypatch: pytest.MonkeyPatch, value: float) -> None:
+    """Let a sweep and those after it find a value that is not finite."""
+    sound, calls = _fit._sweep, []
+
+    def broken(free, start):
+        calls.append(1)
+        scheme, control = sound(free, start)
+        if len(calls) < sweep:
+            return scheme, control
+        return scheme, js.Control(control.vertices.at[3, 1].set(value), control.normals)
+
+    monkeypatch.setattr(_fit, "_sweep", broken)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_values_that_are_not_finite_end_the_fit_at_the_last_sound_sweep(monkeypatch, value):
+    sound = problem().fit(max_sweeps=2)
+    broken_from(3, monkeypatch, value)
+    found = problem().fit()
+    assert found.result == NONFINITE
+    np.testing.assert_array_equal(found.rms, sound.rms)
+    np.testing.assert_array_equal(found.control.vertices, sound.control.vertices)
+    np.testing.assert_array_equal(found.surface.vertices, sound.surface.vertices)
+    json.loads(found.report().as_json())
+    assert "NOT CONVERGED: Nonfinite" in str(found.report())
+
+
+def test_values_that_are_not_finite_are_an_error_in_words(monkeypatch):
+    broken_from(1, monkeypatch, np.nan)
+    with pytest.raises(RuntimeError, match=r"did not converge in 0 sweeps .* Nonfinite"):
+        problem().fit(throw=True)
+
+
+@pytest.mark.parametrize("unit", [1e-160, 1e-6, 1e6])
+def test_no_unit_brings_out_values_that_are_not_finite(unit):
+    p = problem()
+    found = p.fit(p.points * unit, control=js.Control(p.start.vertices * unit, p.start.normals), max_sweeps=5)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((found.control, found.scheme, found.surface)))
+    assert np.isfinite(found.rms).all() and np.isfinite(found.distances).all()
+
+
+def refused(**options) -> dict:
+    return options
+
+
+def test_refuses_what_cannot_be_fitted():
+    p = problem()
+    flat = js.build_topology(p.mesh, js.Interpolating(), 0)
+    single = js.Control(p.start.vertices.astype(np.float32), p.start.normals.astype(np.float32))
+    x, n = p.start.vertices, p.start.normals
+    for error, words, options in (
+        (ValueError, r"one level or more; this one has none", refused(topology=flat)),
+        (
+            ValueError,
+            r"has 12 control vertices, so .* \[12, 3\]; got \[5, 3\]",
+            refused(control=js.Control(x[:5], n[:5])),
+        ),
+        (ValueError, r"1 levels, so `h` must be .* \[1\]; got \[2\]", refused(scheme=js.Interpolating([1.0, 1.0]))),
+        (ValueError, r"default floating dtype, float64; got float32 and float64", refused(control=single)),
+        (ValueError, r"got float64 and float32", refused(points=p.points.astype(np.float32))),
+        (ValueError, r"vertices or h are not finite", refused(control=js.Control(x.at[0].set(np.nan), n))),
+        (ValueError, r"vertices or h are not finite", refused(scheme=js.Interpolating(np.inf))),
+        (ValueError, r"control vertices lie on one spot", refused(control=js.Control(0 * x, n))),
+        (ScanError, r"11 points for 12 control vertices\. Fit a coarser", refused(points=p.points[:11])),
+        (ScanError, r"points lie on one spot", refused(points=np.ones((20, 3)))),
+        (
+            ScanError,
+            r"scan measures 0\.0\d+ across .* mesh 6\d\.\d+: their units differ",
+            refused(points=p.points / 1000),
+        ),
+        (ScanError, r"their units differ.*`scale=` \(1000 for metres\)", refused(points=p.points * 1000)),
+    ):
+        with pytest.raises(error, match=words):
+            p.fit(**options)
+
+
+def test_start_that_is_far_off_is_warned_of():
+    p = problem()
+    with pytest.warns(UserWarning, match=r"half of the scan lies over 8\.\d+ mm from the surface.*Align"):
+        p.fit(p.points + (25, 0, 0), max_sweeps=0)
+
+
+# Compilation
+
+
+def test_sweeps_share_one_compiled_program():
+    """Whatever the scheme's h, the priors, the weights and the values are."""
+    mesh = control_mesh(meshes.tetrahedron())
+    scheme = js.CirclePreserving([1.0])
+    topology = js.build_topology(mesh, scheme, 1)
+    control = mesh.control(weights="sphere")
+    points = np.asarray(
+        js.sample(js.refine(js.CirclePreserving([1.1]), topology, control), 100, jax.random.key(0)).points
+    )
+    before = _fit._sweep._cached._cache_size()
+    fit = functools.partial(fitting.fit, topology=topology, control=control, throw=False)
+    found = fit(scheme, scan=Scan(points), priors=NO_PRIORS, loss=fitting.LeastSquares(), max_sweeps=9)
+    assert len(found.rms) > 3 and found.rms[-1] < 0.1 * found.rms[0]
+    assert found.scheme.h.shape == (1,) and isinstance(found.scheme, js.CirclePreserving)
+    weighted = Scan(points, weights=np.linspace(0.5, 1, 100))
+    fit(js.CirclePreserving([0.9]), scan=weighted, max_sweeps=2)
+    assert _fit._sweep._cached._cache_size() == before + 1
+
+
+# What may move
+
+
+@pytest.mark.parametrize("name", ["vertices", "normals", "h"])
+def test_only_what_is_free_moves_and_it_is_found(name):
+    p, free = problem(), Free(**{other: other == name for other in ("vertices", "normals", "h")})
+    vertices = p.start.vertices if free.vertices else p.truth.vertices
+    control = js.Control(vertices, p.start.normals if free.normals else p.truth.normals)
+    scheme = js.Interpolating(1.0 if free.h else p.h)
+    options = {"scheme": scheme, "control": control, "free": free, "priors": NO_PRIORS}
+    begin, found = p.fit(**options, max_sweeps=0), p.fit(**options)
+    assert found.rms[0] > 0.05 and found.rms[-1] < 3e-3
+    for part, truth in (("vertices", p.truth.vertices), ("normals", p.truth.normals), ("h", p.h)):
+        before, after = (getattr(r.scheme if part == "h" else r.control, part) for r in (begin, found))
+        if part == name:
+            assert np.abs(before - truth).max() > 0.1
+            np.testing.assert_allclose(after, truth, atol=0.06)
+        else:
+            np.testing.assert_array_equal(after, before)
+
+
+# Open surfaces
+
+
+@pytest.mark.parametrize("n_far", [0, 60])
+def test_points_beyond_an_open_boundary_pull_it_only_when_near(n_far):
+    """A sheet of 20 mm grows to a scan that reaches 2 mm beyond it, and leaves a patch that is farther off alone."""
+    vertices, faces = meshes.grid(2, 2, "quad")
+    mesh, rng = js.ControlMesh(10 * vertices, faces), np.random.default_rng(0)
+    topology = js.build_topology(mesh, js.Interpolating(), 1)
+    flat = np.concatenate([rng.uniform(-2, 22, (400 - n_far, 2)), rng.uniform(35, 45, (n_far, 2))])
+    scan = Scan(np.column_stack([flat, rng.normal(scale=0.1, size=400)]))
+    free = Free(normals=False, h=False)
+    found = fitting.fit(js.Interpolating(), topology, mesh.control(), scan, free=free)
+    assert not np.any(found.weights[400 - n_far :])
+    assert found.weights[: 400 - n_far].mean() > 0.9
+    x, y = np.asarray(found.control.vertices)[:, :2].T
+    for ends in (x.min(), y.min(), 20 - x.max(), 20 - y.max()):
+        assert -3.5 < ends < -1.2
+
+
+# The report
+
+
+def test_report_has_the_numbers_of_the_distances(noisy):
+    report, d = noisy.report(), np.abs(noisy.distances)
+    assert report.converged and report.reason == "" and report.sweeps == len(noisy.rms) - 1
+    assert report.rms_start == noisy.rms[0] and report.rms_per_sweep == noisy.rms.tolist()
+    expected = {
+        "rms": np.sqrt((d**2).mean()),
+        "mean": d.mean(),
+        "median": np.sort(d)[[299, 300]].mean(),
+        "percentile_95": np.quantile(d, 0.95),
+        "maximum": d.max(),
+        "bias": noisy.distances.mean(),
+        "inlier_share": (d <= 3 * noisy.noise).mean(),
+        "rms_inliers": np.sqrt((d[d <= 3 * noisy.noise] ** 2).mean()),
+        "noise": noisy.noise,
+        "h": float(noisy.scheme.h),
+    }
+    for name, value in expected.items():
+        np.testing.assert_allclose(getattr(report, name), value, rtol=1e-12, err_msg=name)
+    assert (report.n_points, report.n_control_vertices, report.n_faces) == (N_POINTS, 12, 8 * 4 + 6 * 4)
+
+
+def test_report_is_the_same_as_values_and_as_json(noisy):
+    report = noisy.report()
+    assert set(report.as_dict()) == {field.name for field in dataclasses.fields(report)}
+    assert json.loads(report.as_json()) == report.as_dict()
+
+
+def test_report_in_words(noisy):
+    text = str(noisy.report())
+    lines = dict(re.split("  +", line, maxsplit=1) for line in text.splitlines())
+    assert lines["fit"] == f"converged after {len(noisy.rms) - 1} sweeps"
+    assert lines["RMS distance"] == f"{noisy.rms[-1]:.3f} mm (from {noisy.rms[0]:.3f} mm)"
+    assert lines["scan points"].startswith("600, ") and lines["tangent length h"] == f"{float(noisy.scheme.h):.4f}"
+    cut_off = str(problem().fit(max_sweeps=1).report())
+    assert re.match(r"fit +NOT CONVERGED: .*maximum number of steps", cut_off)
+
+
+def test_report_of_a_fit_with_one_h_a_level_lists_them():
+    report = dataclasses.replace(problem().fit(max_sweeps=0).report(), h=[1.25, 0.5])
+    assert "1.2500, 0.5000" in str(report) and json.loads(report.as_json())["h"] == [1.25, 0.5]
+
+
+def test_report_refuses_numbers_that_json_does_not_have():
+    report = dataclasses.replace(problem().fit(max_sweeps=0).report(), rms=float("nan"))
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        report.as_json()
+
+
+# What the package is for: a scan of a part of a body, and a control mesh that is wrong by millimetres
+
+
+def test_example_of_the_command_line_comes_back_within_a_third_of_a_millimetre(tmp_path, capsys, command_settings):
+    status = fitting_command(["--example", "head_fragment", "-o", str(tmp_path / "out")])
+    out = capsys.readouterr().out
+    assert status == 0
+    assert "moved by noise of 3 mm in each coordinate" in out
+    assert re.search(r"^fit +converged after \d+ sweeps$", out, re.MULTILINE)
+    start, end = (
+        float(re.search(rf"^RMS distance .*?{part}([0-9.]+) mm", out, re.MULTILINE)[1]) for part in (r"from ", "")
+    )
+    assert start > 1.5 and 0 < end < 0.35
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "control.obj",
+        "fit.png",
+        "report.json",
+        "surface.ply",
+    ]
+
+    _, original = fitting.example("head_fragment")
+    control = js.read_mesh(tmp_path / "out" / "control.obj")
+    assert len(control.vertices) == 165 and len(control.faces[4]) == 140 and len(control.faces[3]) == 0
+    np.testing.assert_array_equal(control.faces[4], original.faces[4])
+    np.testing.assert_allclose(np.linalg.norm(control.normals, axis=1), 1, atol=1e-6)
+
+    surface = meshio.read(tmp_path / "out" / "surface.ply")
+    assert surface.cells_dict["quad"].shape == (140 * 4**3, 4) and "triangle" not in surface.cells_dict
+    known = surface.point_data["distance_mm"][~np.isnan(surface.point_data["distance_mm"])]
+    assert len(known) > 0.9 * len(surface.points) and rms(known) < 0.35
+
+    own = float(json.loads((tmp_path / "out" / "report.json").read_text())["rms"])
+    np.testing.assert_allclose(own, end, atol=6e-4)
+    assert (tmp_path / "out" / "fit.png").read_bytes().startswith(b"\x89PNG\r\n")
+    assert (tmp_path / "out" / "fit.png").stat().st_size > 50_000
+
+
+def test_closed_example_comes_back_within_a_third_of_a_millimetre():
+    scan, mesh = fitting.example("femur_distal")
+    noise = np.random.default_rng(0).normal(scale=3.0, size=mesh.vertices.shape)
+    start = js.ControlMesh(mesh.vertices + noise, mesh.faces, mesh.normals)
+    topology = js.build_topology(start, js.Interpolating(), 2)
+    found = fitting.fit(js.Interpolating(), topology, start.control(), scan)
+    assert found.rms[0] > 1.5 and found.rms[-1] < 0.35
+    assert f"{found.rms[-1]:.3f} mm" in str(found.report()) and "converged after" in str(found.report())

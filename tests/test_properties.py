@@ -1,0 +1,494 @@
+"""What is true of the refinement, as tests over every scheme and option for which it should hold."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import meshes
+import numpy as np
+import pytest
+import reference
+from schemes import (
+    CASES,
+    LEVELS,
+    MIXED,
+    PART,
+    SHEET,
+    by_name,
+    control_mesh,
+    inherited,
+    mixed_topology,
+    on_host,
+    over_cases,
+    random_control,
+    refine_mixed,
+)
+
+import jaxsubdiv as js
+from jaxsubdiv._refine import _refine
+
+KEEPING = [case for case in CASES if not case.scheme.recomputes_normals]
+CONTROL = random_control(MIXED, seed=5)
+X, N = np.asarray(CONTROL.vertices), np.asarray(CONTROL.normals)
+ROTATION = np.linalg.qr(np.random.default_rng(6).normal(size=(3, 3)))[0]
+ROTATION *= np.linalg.det(ROTATION)
+
+
+def refine(scheme: js.AbstractScheme, mesh: meshes.Mesh, levels: int, normals=None) -> js.RefinedSurface:
+    """Refine a mesh with the normals given, or with its own."""
+    checked = js.ControlMesh(*mesh, normals)
+    return on_host(js.refine(scheme, js.build_topology(checked, scheme, levels), checked.control()))
+
+
+def unit(rows) -> np.ndarray:
+    return np.asarray(rows) / np.linalg.norm(rows, axis=-1, keepdims=True)
+
+
+def part_of_vertex(topology: js.Topology) -> np.ndarray:
+    return inherited(topology, PART).astype(int)
+
+
+# ------------------------------------------------------------------------------------------------ what stays as it is
+
+
+@over_cases()
+def test_control_vertices_are_copied_bit_by_bit(case):
+    surface = refine_mixed(case, CONTROL)
+    assert np.array_equal(surface.vertices[: len(PART)], X)
+
+
+@pytest.mark.parametrize("case", KEEPING, ids=lambda case: case.name)
+def test_kept_normals_are_the_control_normals_made_unit(case):
+    surface = refine_mixed(case, CONTROL)
+    np.testing.assert_allclose(surface.normals[: len(PART)], unit(N), rtol=0, atol=1e-15)
+
+
+@over_cases()
+def test_normals_have_length_one(case):
+    np.testing.assert_allclose(np.linalg.norm(refine_mixed(case, CONTROL).normals, axis=1), 1, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("h", [0.0, 0.5, 1.0, 2.5])
+@over_cases()
+def test_planes_stay_planes(case, h):
+    flat = X * (1, 1, 0) @ ROTATION.T + 3
+    up = ROTATION[:, 2]
+    control = js.Control(flat, np.outer(np.linspace(0.5, 2, len(flat)), up))
+    topology = mixed_topology(case.scheme.recomputes_normals)
+    surface = on_host(js.refine(case.with_h(np.full(case.scheme.h.shape, h)), topology, control))
+    sheet = part_of_vertex(topology) == SHEET  # the closed parts are pressed flat: their sides face both ways
+    np.testing.assert_allclose((surface.vertices[sheet] - 3) @ up, 0, atol=1e-12)
+    np.testing.assert_allclose(surface.normals[sheet], np.tile(up, (sheet.sum(), 1)), rtol=0, atol=1e-12)
+
+
+@over_cases("flat at h = 0")
+def test_h_zero_is_flat_midpoint_splitting(case):
+    scheme = case.with_h(np.zeros(case.scheme.h.shape))
+    topology = mixed_topology(scheme.recomputes_normals)
+    surface = on_host(js.refine(scheme, topology, CONTROL))
+    np.testing.assert_allclose(surface.vertices, inherited(topology, X), rtol=0, atol=1e-14)
+
+
+def test_unused_vertices_survive_and_change_nothing():
+    vertices, faces = meshes.pyramid()
+    with_more = np.insert(vertices, 2, (9, 9, 9), axis=0)
+    skipping = [tuple(corner + (corner >= 2) for corner in face) for face in faces]
+    plain, more = (refine(js.Interpolating(), mesh, 1) for mesh in ((vertices, faces), (with_more, skipping)))
+    assert np.array_equal(more.vertices[2], (9, 9, 9)) and np.array_equal(more.normals[2], (0, 0, 0))
+    np.testing.assert_allclose(np.delete(more.vertices[:6], 2, axis=0), plain.vertices[:5], atol=1e-14)
+    # Edges are sorted by their vertices, so their order stays.
+    np.testing.assert_allclose(more.vertices[6:], plain.vertices[5:], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(more.normals[6:], plain.normals[5:], rtol=0, atol=1e-14)
+
+
+def test_no_levels_give_the_control_with_unit_normals():
+    checked = js.ControlMesh(*meshes.mixed_closed())
+    control = js.Control(checked.vertices, 3 * checked.vertices)
+    surface = js.refine(js.Interpolating(), js.build_topology(checked, js.Interpolating(), 0), control)
+    assert np.array_equal(surface.vertices, checked.vertices)
+    np.testing.assert_allclose(surface.normals, unit(checked.vertices), rtol=0, atol=1e-15)
+    assert all(np.array_equal(surface.faces[size], checked.faces[size]) for size in (3, 4))
+
+
+def test_eight_levels_run():
+    control = js.Control(np.eye(3), np.eye(3))
+    checked = js.ControlMesh(control.vertices, [(0, 1, 2)])
+    surface = on_host(js.refine(js.Interpolating(), js.build_topology(checked, js.Interpolating(), 8), control))
+    assert surface.faces[3].shape == (4**8, 3) and surface.vertices.shape == (257 * 258 // 2, 3)
+    assert np.isfinite(surface.vertices).all()
+    # Triangles 1/256 of the first one in size, none of them folded back.
+    a, b, c = np.moveaxis(surface.vertices[surface.faces[3]], 1, 0)
+    assert np.all(np.cross(b - a, c - a) @ np.ones(3) > 0)
+
+
+# ------------------------------------------------------------------------------------------------------- equivariance
+
+
+@over_cases()
+def test_moves_with_a_rigid_motion(case):
+    surface = refine_mixed(case, CONTROL)
+    moved = refine_mixed(case, js.Control(X @ ROTATION.T + 7.0, N @ ROTATION.T))
+    np.testing.assert_allclose(moved.vertices, surface.vertices @ ROTATION.T + 7.0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(moved.normals, surface.normals @ ROTATION.T, rtol=0, atol=1e-12)
+
+
+def scaled(case, factor: float) -> tuple[js.RefinedSurface, js.RefinedSurface]:
+    return refine_mixed(case, CONTROL), refine_mixed(case, js.Control(factor * X, N))
+
+
+@pytest.mark.parametrize("factor", [1e-3, 25.4])
+@over_cases("scale")
+def test_grows_with_a_uniform_scale(case, factor):
+    surface, larger = scaled(case, factor)
+    np.testing.assert_allclose(larger.vertices / factor, surface.vertices, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(larger.normals, surface.normals, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if "scale" in case.lacks], ids=lambda case: case.name)
+def test_printed_twist_depends_on_the_unit(case):
+    surface, larger = scaled(case, 25.4)
+    assert np.abs(larger.vertices / 25.4 - surface.vertices).max() > 1e-2
+
+
+def match(one: js.RefinedSurface, other: js.RefinedSurface) -> np.ndarray:
+    """For every vertex of `one` the vertex of `other` at its place."""
+    gaps = np.linalg.norm(one.vertices[:, None] - other.vertices, axis=2)
+    nearest = gaps.argmin(axis=1)
+    assert gaps.min(axis=1).max() < 1e-12 and len(np.unique(nearest)) == len(nearest)
+    return nearest
+
+
+def cycles(faces: dict, label: np.ndarray | None = None) -> set[tuple[int, ...]]:
+    """Faces from their smallest corner on, under other labels."""
+    rows = [tuple(row if label is None else label[row]) for size in (3, 4) for row in faces[size]]
+    return {face[face.index(min(face)) :] + face[: face.index(min(face))] for face in rows}
+
+
+@over_cases()
+def test_names_and_order_of_vertices_and_faces_do_not_matter(case):
+    told, of_vertex, _ = meshes.relabelled(MIXED, seed=3, turn="first corner" not in case.lacks)
+    topology = js.build_topology(js.ControlMesh(*told), case.scheme, LEVELS)
+    other = on_host(js.refine(case.scheme, topology, js.Control(X[of_vertex], N[of_vertex])))
+    surface = refine_mixed(case, CONTROL)
+    at = match(other, surface)
+    np.testing.assert_allclose(other.normals, surface.normals[at], rtol=0, atol=1e-12)
+    assert cycles(other.faces, at) == cycles(surface.faces)
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if "first corner" in case.lacks], ids=lambda case: case.name)
+def test_printed_twist_depends_on_the_first_corner_of_a_quad(case):
+    turned = [face[1:] + face[:1] for face in MIXED[1]]
+    topology = js.build_topology(control_mesh((MIXED[0], turned)), case.scheme, LEVELS)
+    other = on_host(js.refine(case.scheme, topology, CONTROL))
+    assert np.abs(other.vertices - refine_mixed(case, CONTROL).vertices).max() > 1e-2
+
+
+@over_cases("first corner")
+def test_turns_inside_out_with_the_faces_and_the_normals(case):
+    turned = [face[:1] + face[:0:-1] for face in MIXED[1]]
+    topology = js.build_topology(control_mesh((MIXED[0], turned)), case.scheme, LEVELS)
+    other = on_host(js.refine(case.scheme, topology, js.Control(X, -N)))
+    surface = refine_mixed(case, CONTROL)
+    at = match(other, surface)
+    np.testing.assert_allclose(other.normals, -surface.normals[at], rtol=0, atol=1e-12)
+    assert cycles({size: rows[:, ::-1] for size, rows in other.faces.items()}, at) == cycles(surface.faces)
+
+
+@over_cases()
+def test_components_do_not_feel_one_another(case):
+    others = PART != SHEET
+    rng = np.random.default_rng(4)
+    shaken = X + others[:, None] * rng.normal(size=X.shape)
+    turned = N * np.where(others, -1, 1)[:, None]
+    surface, other = refine_mixed(case, CONTROL), refine_mixed(case, js.Control(shaken, turned))
+    sheet = part_of_vertex(mixed_topology(case.scheme.recomputes_normals)) == SHEET
+    np.testing.assert_allclose(other.vertices[sheet], surface.vertices[sheet], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(other.normals[sheet], surface.normals[sheet], rtol=0, atol=1e-13)
+    assert np.abs(other.vertices[~sheet] - surface.vertices[~sheet]).max() > 0.1
+
+
+# --------------------------------------------------------------------------------------------------- weights and PN
+
+
+def stencil(mesh: meshes.Mesh, h: float) -> tuple[js.Topology, np.ndarray]:
+    """Heights of the edge vertices over a flat sheet as weights of the control heights, normals from the mesh."""
+    scheme = js.Interpolating(h)
+    topology = js.build_topology(js.ControlMesh(*mesh), scheme, 1)
+
+    def heights(z: jax.Array) -> jax.Array:
+        vertices = jnp.concatenate([jnp.asarray(mesh[0][:, :2]), z[:, None]], axis=1)
+        control = js.Control(vertices, js.estimate_normals(topology.control_fans, vertices))
+        return js.refine(scheme, topology, control).vertices[len(z) :, 2]
+
+    return topology, np.asarray(jax.jit(jax.jacfwd(heights))(jnp.zeros(len(mesh[0]))))
+
+
+def weights_at(
+    mesh: meshes.Mesh, h: float, places: dict[float, list[tuple[int, int]]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weights of the edge from (2, 2) to (3, 2), and the expected ones: each weight with its places in the grid."""
+    topology, weights = stencil(mesh, h)
+    ends = at(2, 2), at(3, 2)
+    row = np.flatnonzero((np.sort(topology.levels[0].edges, axis=1) == ends).all(axis=1))
+    expected = np.zeros(len(mesh[0]))
+    for weight, cells in places.items():
+        expected[[at(*cell) for cell in cells]] = weight
+    return weights[row[0]], expected
+
+
+def at(x: int, y: int) -> int:
+    """Number of a vertex in a grid of 5 by 4 cells."""
+    return 5 * x + y
+
+
+@pytest.mark.parametrize("h", [1.0, 0.6])
+def test_edges_of_a_flat_quad_grid_have_the_four_point_weights(h):
+    w = h / 16
+    places = {1 / 2 + w: [(2, 2), (3, 2)], -w: [(1, 2), (4, 2)]}
+    np.testing.assert_allclose(*weights_at(meshes.grid(5, 4), h, places), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("h", [1.0, 0.6])
+def test_edges_of_a_flat_triangle_grid_have_the_butterfly_weights(h):
+    vertices, faces = meshes.grid(5, 4, "triangle")
+    # The diagonals run from (0, 0) to (1, 1); sheared, the edges of all three directions are alike.
+    x, y = vertices[:, 0] - vertices[:, 1] / 2, np.sqrt(3) / 2 * vertices[:, 1]
+    tension, w = h / 16, -h / 24  # the two parameters of the 10-point butterfly
+    places = {
+        1 / 2 - w: [(2, 2), (3, 2)],
+        2 * (tension + w): [(3, 3), (2, 1)],
+        -tension - w: [(1, 1), (3, 1), (2, 3), (4, 3)],
+        w: [(1, 2), (4, 2)],
+    }
+    flat = np.stack([x, y, vertices[:, 2]], axis=1)
+    np.testing.assert_allclose(*weights_at((flat, faces), h, places), rtol=0, atol=1e-15)
+
+
+def test_first_edge_points_are_the_middles_of_the_pn_triangle():
+    rng = np.random.default_rng(8)
+    for _ in range(5):
+        vertices, normals = rng.normal(size=(2, 3, 3))
+        surface = refine(js.Interpolating(), (vertices, [(0, 1, 2)]), 1, normals)
+        middles = reference.pn_triangle_edge_middles(vertices, normals)
+        np.testing.assert_allclose(surface.vertices[[3, 5, 4]], middles, rtol=0, atol=1e-14)  # edges 01, 02, 12
+
+
+# ------------------------------------------------------------------------------------------------------------ accuracy
+
+
+@functools.cache
+def torus_error(circle: bool, h: float, n: int, kind: str) -> float:
+    """Largest distance from the torus of radii 2 and 1, `2 n` cells by `n`, with its own normals."""
+    scheme = js.CirclePreserving(h) if circle else js.Interpolating(h)
+    vertices, faces = meshes.torus(2 * n, n, kind)
+    surface = refine(scheme, (vertices, faces), 1, vertices - 2 * unit(vertices * (1, 1, 0)))
+    across = np.linalg.norm(surface.vertices[:, :2], axis=1) - 2
+    return np.abs(np.hypot(across, surface.vertices[:, 2]) - 1).max()
+
+
+@pytest.mark.parametrize("kind", ["quad", "triangle"])
+def test_order_is_four_with_exact_normals_and_h_one_alone(kind):
+    order, of_other_h = (np.log2(torus_error(False, h, 10, kind) / torus_error(False, h, 20, kind)) for h in (1.0, 1.2))
+    assert 3.7 < order < 4.3
+    assert of_other_h < 2.3
+
+
+def test_circle_preserving_scheme_is_closer_to_a_torus():
+    order = np.log2(torus_error(True, 1.0, 10, "quad") / torus_error(True, 1.0, 20, "quad"))
+    assert 3.7 < order < 4.3
+    assert torus_error(True, 1.0, 20, "quad") < torus_error(False, 1.0, 20, "quad") / 4
+
+
+@pytest.mark.parametrize(
+    ("name", "best"), [("tetrahedron", 1.83), ("octahedron", 1.46), ("icosahedron", 1.206), ("cube", 1.51)]
+)
+def test_best_constant_h_on_a_sphere(name, best):
+    vertices, faces = getattr(meshes, name)()
+    vertices = unit(vertices)
+
+    def error(h: float) -> float:
+        surface = refine(js.Interpolating(h), (vertices, faces), 4, vertices)
+        return np.mean((np.linalg.norm(surface.vertices, axis=1) - 1) ** 2)
+
+    step = 0.05
+    below, here, above = (error(best + shift) for shift in (-step, 0, step))
+    bottom = best + step / 2 * (below - above) / (below - 2 * here + above)  # of the parabola through all three
+    assert abs(bottom - best) < 0.015
+
+
+@pytest.mark.parametrize("name", ["icosahedron", "cube"])
+def test_displacements_shrink_to_about_a_third_a_level(name):
+    mesh, scheme, levels = getattr(meshes, name)(), js.Interpolating(), 5
+    topology = js.build_topology(js.ControlMesh(*mesh), scheme, levels)
+    surface, first, largest = refine(scheme, mesh, levels), len(mesh[0]), []
+    for level in topology.levels:
+        edges = np.asarray(level.edges)
+        bend = surface.vertices[first : first + len(edges)] - surface.vertices[edges].mean(axis=1)
+        largest.append(np.linalg.norm(bend, axis=1).max())
+        first += len(edges) + len(level.quads)
+    ratios = np.divide(largest[1:], largest[:-1])
+    assert 0.30 < ratios[-1] < 0.36
+    assert np.all(np.diff(ratios) < 0)
+
+
+def on_a_sphere() -> np.ndarray:
+    """The parts of `MIXED` laid on the unit sphere, no two neighbours 120 degrees apart."""
+    sheets = np.isin(PART, (SHEET, SHEET + 1))
+    return unit(np.where(sheets[:, None], MIXED[0] * (0.4, 0.4, 0) + (0.1, 0, 1), X))
+
+
+@over_cases("sphere")
+def test_spheres_are_kept_by_schemes_that_claim_it(case):
+    normals, centre, radius = on_a_sphere(), np.array([3.0, -1.0, 2.0]), 5.0
+    one = case._replace(scheme=case.with_h(np.ones(case.scheme.h.shape)))
+    surface = refine_mixed(one, js.Control(centre + radius * normals, normals))
+    np.testing.assert_allclose(surface.vertices, centre + radius * surface.normals, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(surface.vertices - centre, axis=1), radius, rtol=1e-13)
+
+
+def test_interpolating_scheme_leaves_a_sphere():
+    normals = on_a_sphere()
+    one = by_name("default")._replace(scheme=js.Interpolating())
+    lengths = np.linalg.norm(refine_mixed(one, js.Control(normals, normals)).vertices, axis=1)
+    assert np.abs(lengths - 1).max() > 0.01
+
+
+def test_round_cylinders_are_kept_by_the_circle_preserving_scheme():
+    angle, height, _ = meshes.grid(3, 2)[0].T
+    normals = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    mesh = (3 * normals + np.outer(height, (0, 0, 1)), meshes.grid(3, 2)[1])
+    surface = refine(js.CirclePreserving(), mesh, 1, normals)
+    outward = unit(surface.vertices * (1, 1, 0))
+    np.testing.assert_allclose(surface.vertices[:, :2], 3 * outward[:, :2], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(surface.normals, outward, rtol=0, atol=1e-13)
+
+
+# -------------------------------------------------------------------------------------------------------------- counts
+
+
+def test_every_level_has_four_times_the_faces_and_the_same_euler_number():
+    mesh = control_mesh(meshes.union(MIXED, meshes.torus(4, 3, "mixed")))
+    finer = mesh
+    for levels in range(4):
+        topology = js.build_topology(mesh, js.Interpolating(), levels)
+        n = len(mesh.vertices) + sum(len(level.edges) + len(level.quads) for level in topology.levels)
+        finer = js.ControlMesh(np.zeros((n, 3)), {size: rows for size, rows in topology.faces.items()}, check=False)
+        assert {size: len(rows) for size, rows in finer.faces.items()} == {
+            size: 4**levels * len(rows) for size, rows in mesh.faces.items()
+        }
+        assert finer.euler_number == mesh.euler_number
+        assert len(np.unique(finer.half_edges.start)) == n
+        assert len(finer.boundary_edges) == 2**levels * len(mesh.boundary_edges)
+
+
+@over_cases("scale")
+def test_faces_keep_the_side_of_their_parents(case):
+    surface = refine_mixed(case, js.ControlMesh(*MIXED).control())
+    for size, parents in control_mesh(MIXED).faces.items():
+        before, after = (
+            unit(areas(vertices, faces))
+            for vertices, faces in ((MIXED[0], parents), (surface.vertices, surface.faces[size]))
+        )
+        cosines = np.sum(np.repeat(before, 4**LEVELS, axis=0) * after, axis=1)
+        assert cosines.min() > 0.5
+
+
+def areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Vector areas of triangles or quads, doubled."""
+    corners = vertices[faces]
+    return np.cross(corners[:, 2] - corners[:, 0], corners[:, -1] - corners[:, 1])
+
+
+def test_coarser_levels_are_prefixes_of_finer_ones():
+    case = by_name("default")
+    finer = refine_mixed(case, CONTROL)
+    topology = js.build_topology(control_mesh(MIXED), case.scheme, LEVELS - 1)
+    coarser = js.refine(case.scheme, topology, CONTROL)
+    n = len(coarser.vertices)
+    assert len(X) < n < len(finer.vertices)
+    np.testing.assert_allclose(coarser.vertices, finer.vertices[:n], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(coarser.normals, finer.normals[:n], rtol=0, atol=1e-14)
+
+
+# ------------------------------------------------------------------------------------------------------------- normals
+
+
+@pytest.mark.parametrize("weights", ["area", "uniform", "angle", "sphere"])
+def test_estimated_normals_agree_with_the_reference(weights):
+    topology = mixed_topology(False)
+    ours = js.estimate_normals(topology.control_fans, CONTROL.vertices, weights)
+    np.testing.assert_allclose(ours, reference.vertex_normals(X, MIXED[1], weights), rtol=0, atol=1e-13)
+    of_mesh = js.ControlMesh(X, MIXED[1]).control(weights=weights)
+    np.testing.assert_allclose(of_mesh.normals, ours, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["default", "circle"])
+def test_mesh_normals_are_those_of_the_last_level(name):
+    scheme, (vertices, faces) = by_name(name).scheme, meshes.pyramid(base=False)
+    checked = js.ControlMesh(vertices, faces)
+    topology = js.build_topology(checked, scheme, 1, mesh_normals=True)
+    surface = on_host(js.refine(scheme, topology, checked.control()))
+    of_mesh = reference.vertex_normals(surface.vertices, surface.faces[3].tolist(), scheme.weights)
+    old = slice(0, len(vertices))  # new vertices on the boundary may have chord normals
+    np.testing.assert_allclose(surface.normals[old], of_mesh[old], rtol=0, atol=1e-13)
+    plain = js.refine(scheme, js.build_topology(checked, scheme, 1), checked.control())
+    np.testing.assert_allclose(surface.vertices, plain.vertices, rtol=0, atol=1e-14)
+    assert np.abs(surface.normals[old] - plain.normals[old]).max() > 1e-3
+
+
+# -------------------------------------------------------------------------------------------- precision, compilation
+
+
+def test_single_precision_stays_single_and_agrees():
+    case = by_name("default")
+    topology = mixed_topology(False)
+    single = js.Control(X.astype(np.float32), N.astype(np.float32))
+    surface = js.refine(case.scheme, topology, single)
+    assert surface.vertices.dtype == surface.normals.dtype == np.float32
+    expected = refine_mixed(
+        case, js.Control(*(np.asarray(rows, np.float64) for rows in (single.vertices, single.normals)))
+    )
+    np.testing.assert_allclose(surface.vertices, expected.vertices, rtol=0, atol=2e-6)
+    np.testing.assert_allclose(surface.normals, expected.normals, rtol=0, atol=2e-5)
+
+
+def test_single_precision_holds_a_metre_from_the_origin():
+    vertices, faces = meshes.icosahedron()
+    vertices = np.asarray(100 * vertices + (1000, -1000, 500), np.float32)  # mm
+    scheme, checked = js.Interpolating(), js.ControlMesh(vertices, faces)
+    topology = js.build_topology(checked, scheme, 5)
+    double = checked.control()
+    single, double = (
+        js.refine(scheme, topology, js.Control(vertices.astype(dtype), np.asarray(double.normals, dtype)))
+        for dtype in (np.float32, np.float64)
+    )
+    np.testing.assert_allclose(single.vertices, double.vertices, rtol=2e-7, atol=0)
+    sines = np.linalg.norm(np.cross(single.normals, double.normals), axis=1)
+    assert np.degrees(sines.max()) < 0.01
+
+
+def test_only_new_sizes_options_and_dtypes_compile_anew():
+    topology = mixed_topology(False)
+    js.refine(js.Interpolating(), topology, CONTROL)
+    compiled = _refine._cache_size()
+    for h in (1.2, 1, np.float64(0.9), jnp.asarray(0.9), jnp.asarray(0.9, jnp.float64)):
+        js.refine(js.Interpolating(h), topology, js.Control(2 * X, N.tolist()))
+    told, _, _ = meshes.relabelled(MIXED, seed=9)
+    js.refine(js.Interpolating(), js.build_topology(js.ControlMesh(*told), js.Interpolating(), LEVELS), CONTROL)
+    assert _refine._cache_size() == compiled
+    refine(js.Interpolating(), (np.eye(3), [(0, 2, 1)]), 1)
+    refine(js.Interpolating(weights="uniform"), (np.eye(3), [(0, 2, 1)]), 1)
+    assert _refine._cache_size() > compiled
+
+
+@over_cases()
+def test_refinement_is_gathers_and_sums_without_scatters(case):
+    topology = mixed_topology(case.scheme.recomputes_normals)
+    program = _refine.lower(case.scheme, topology, CONTROL).as_text()
+    assert "gather" in program and "scatter" not in program
+
+
+def test_gradients_have_the_scatters_that_a_search_would_find():
+    topology, scheme = mixed_topology(False), js.Interpolating()
+    slope = jax.jit(jax.grad(lambda control: js.refine(scheme, topology, control).vertices.sum()))
+    assert "scatter" in slope.lower(CONTROL).as_text()
