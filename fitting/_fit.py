@@ -5,31 +5,27 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 import jaxsubdiv as js
-from jaxsubdiv._linalg import dot, norm, unit
-from jaxsubdiv._surface import corner_weights
+from jaxsubdiv._linalg import unit
 
-from ._correspondence import boundary_vertices, closest_points
+from ._correspondence import boundary_vertices
 from ._free import Free, apply_offset, edge_length, no_offset
-from ._residuals import Correspondence, Priors, Start, residuals
+from ._look import look
+from ._residuals import Priors, Start, residuals
 from ._result import FitResult
-from ._robust import AbstractLoss, geman_mcclure, noise_scale
+from ._robust import AbstractLoss, geman_mcclure
 from ._scan import Scan, ScanError
 
 # Few steps a sweep: with points paired wrongly still, an exact solution would follow the pairing.
 _STEPS_A_SWEEP = 3
 # Inner iterations end at this relative accuracy; a tighter solve costs more than the next sweep gains.
 _LINEAR_TOLERANCE = 1e-3
-# A point beyond an open boundary by this many sigma, or by a control edge, belongs to what the mesh does not cover.
-_BEYOND = 4.0
-_ON_BOUNDARY = 1e-3  # how far, in parts of a face, a surface point may lie from a boundary and count as on it
 # A start that is off by more than this part of the control mesh's size is not roughly aligned.
 _FAR = 0.05
 # Scans in metres against a mesh in mm differ by 1000; a partial scan of the anatomy by much less than this.
@@ -50,9 +46,9 @@ def fit(
     control: js.Control,
     scan: Scan,
     *,
-    free: Free = Free(),  # noqa: B008  # immutable
-    priors: Priors = Priors(),  # noqa: B008  # immutable
-    loss: AbstractLoss = geman_mcclure(),  # noqa: B008  # immutable
+    free: Free | None = None,
+    priors: Priors | None = None,
+    loss: AbstractLoss | None = None,
     max_sweeps: int = 60,
     tolerance: float = 2e-3,
     throw: bool = True,
@@ -70,9 +66,9 @@ def fit(
         topology: tables of the control mesh, of one level or more.
         control: where the fit starts, roughly aligned with the scan and in mm.
         scan: the measured points in mm.
-        free: what may move.
-        priors: strengths of what is known beforehand.
-        loss: how a point loses weight with its distance. The default bears a majority of outliers; `Huber` is milder.
+        free: what may move; default: all of `Free()`.
+        priors: strengths of what is known beforehand; default: `Priors()`.
+        loss: how a point loses weight with its distance; default: `geman_mcclure()`.
         max_sweeps: how many sweeps at most.
         tolerance: converged once a sweep, annealed, changes the robust RMS distance by less than this part of it.
         throw: raise where the fit did not converge, or return the reason in `FitResult.result`.
@@ -85,10 +81,12 @@ def fit(
         RuntimeError: with `throw`, the fit did not converge or met values that are not finite.
     """
     _check(scheme, topology, control, scan)
+    # Made here and not in the signature: arrays made while a module loads would settle JAX's device and precision.
+    free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
     control = js.Control(control.vertices, _given_normals(topology, control))
     surface = js.refine(scheme, topology, control)
     open_vertices, edge = boundary_vertices(surface), float(edge_length(topology, control.vertices))
-    seen = _look(surface, scan, open_vertices, edge, loss, np.inf)
+    seen = look(surface, scan, open_vertices, edge, loss, np.inf)
     widest = float(seen.scale)
     _warn_if_far(float(np.median(np.abs(seen.distances))), control)
     rms, robust_rms, result = [float(seen.rms)], [float(seen.robust_rms)], optx.RESULTS.nonlinear_max_steps_reached
@@ -101,7 +99,7 @@ def fit(
             break
         (scheme, control), surface = proposed, refined
         floor = widest * 0.5 ** (sweep + 1)
-        seen = _look(surface, scan, open_vertices, edge, loss, floor)
+        seen = look(surface, scan, open_vertices, edge, loss, floor)
         rms.append(float(seen.rms))
         robust_rms.append(float(seen.robust_rms))
         if on_sweep is not None:
@@ -146,65 +144,6 @@ def _sweep(free: Free, start: Start) -> tuple[js.AbstractScheme, js.Control]:
         throw=False,
     ).value
     return apply_offset(start.topology, start.scheme, start.control, offset)
-
-
-class _Look(NamedTuple):
-    """The scan as seen from one surface."""
-
-    at: js.SurfacePoint
-    pairs: Correspondence
-    distances: Float[Array, "p"]
-    """Signed, positive outside."""
-    weights: Float[Array, "p"]
-    scale: Float[Array, ""]
-    """Of the robust loss: the noise, or what the annealing keeps it at."""
-    rms: Float[Array, ""]
-    robust_rms: Float[Array, ""]
-
-
-def _look(
-    surface: js.RefinedSurface,
-    scan: Scan,
-    open_vertices: Bool[np.ndarray, "v"],
-    edge: float,
-    loss: AbstractLoss,
-    floor: float,
-) -> _Look:
-    at = closest_points(surface, np.asarray(scan.points))
-    return _measure(surface, scan, at, open_vertices, edge, loss, jnp.asarray(floor, scan.points.dtype))
-
-
-@jax.jit
-def _measure(
-    surface: js.RefinedSurface,
-    scan: Scan,
-    at: js.SurfacePoint,
-    open_vertices: Bool[Array | np.ndarray, "v"],
-    edge: float | Float[Array, ""],
-    loss: AbstractLoss,
-    floor: Float[Array, ""],
-) -> _Look:
-    on, normals = js.evaluate(surface, at)
-    away = scan.points - on
-    distance, given = norm(away)[:, 0], scan.weights_or_ones()
-    corners, inside = corner_weights(surface, at)
-    at_boundary = jnp.sum(jnp.where(open_vertices[corners], inside, 0.0), axis=1) > 1 - _ON_BOUNDARY
-    # Beyond a boundary the distance runs along the surface, and says nothing of the noise across it.
-    counted = jnp.where(at_boundary, 0.0, given)
-    # An infinite floor asks for the widest scale: every point that is not far beyond the rest counts in full.
-    widest = 3 * jnp.sqrt(jnp.average(distance**2, weights=given))
-    scale = jnp.maximum(noise_scale(distance, counted), jnp.minimum(floor, widest))
-    weights = given * loss.weight(distance / jnp.maximum(scale, jnp.finfo(scale.dtype).tiny))
-    weights = jnp.where(at_boundary & (distance > jnp.minimum(_BEYOND * scale, edge)), 0.0, weights)
-    return _Look(
-        at=at,
-        pairs=Correspondence(scan.points, corners, inside, normals, weights / jnp.mean(weights), at_boundary),
-        distances=jnp.where(dot(normals, away)[:, 0] < 0, -distance, distance),
-        weights=weights,
-        scale=scale,
-        rms=jnp.sqrt(jnp.average(distance**2, weights=given)),
-        robust_rms=jnp.sqrt(jnp.average(distance**2, weights=weights)),
-    )
 
 
 def _given_normals(topology: js.Topology, control: js.Control) -> Float[Array, "v 3"]:

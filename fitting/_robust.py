@@ -1,7 +1,6 @@
 """Robust losses as weights: how much a point counts that lies far off, in units of the noise."""
 
 from abc import abstractmethod
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp

@@ -194,9 +194,10 @@ def test_circle_factor_is_flat_beyond_120_degrees_only(degrees):
     assert np.any(slope) == (degrees < 120)
 
 
-@pytest.mark.parametrize("case", [by_name("default"), by_name("circle")], ids=lambda case: case.name)
-def test_compiled_gradients_of_a_batch_agree_with_central_differences(case):
-    topology = js.build_topology(control_mesh(MESH), case.scheme, 2)
+@pytest.mark.parametrize(("name", "levels"), [("default", 2), ("circle", 1)])
+def test_compiled_gradients_of_a_batch_agree_with_central_differences(name, levels):
+    case = by_name(name)
+    topology = js.build_topology(control_mesh(MESH), case.scheme, levels)
     at = point(case, random_control(MESH, seed=2, bumps=0.2))
     rng = np.random.default_rng(3)
     along = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), at)

@@ -10,7 +10,7 @@ import jaxsubdiv as js
 
 # Meshes of one kind of faces have tables of their own shape; the rules that run on them are the same.
 ONE_KIND = {
-    "quads": (QUADS, ["default", "printed-angle-recompute", "circle"]),
+    "quads": (QUADS, ["default", "printed-recompute-chord", "circle"]),
     # Compiled for these, edge vertices once differed by rounding from their own copies in their rings.
     "triangles": (TRIANGLES, ["default", "uniform-recompute", "printed-sphere"]),
 }
