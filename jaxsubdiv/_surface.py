@@ -115,7 +115,7 @@ def sum_corners(
 
 @partial(jax.jit, static_argnums=1)
 def sample_surface_points(surface: RefinedSurface, n: int, key: PRNGKeyArray | Array) -> SurfacePoint:
-    """`n` places drawn uniformly by area; the draw has no gradient. Quads count as their two triangles."""
+    """`n` places drawn by area; the draw has no gradient. See `sample` for what it is in quads."""
     areas = jax.lax.stop_gradient(surface._triangle_areas())
     of_triangle, of_uv = jax.random.split(key)
     triangle = jax.random.choice(of_triangle, areas.shape[0], (n,), p=areas / areas.sum())
@@ -133,6 +133,9 @@ def sample_surface_points(surface: RefinedSurface, n: int, key: PRNGKeyArray | A
 
 def sample(surface: RefinedSurface, n: int, key: PRNGKeyArray | Array) -> PointsAndNormals:
     """`n` points drawn uniformly by area, and the normals there; differentiable in the surface at fixed places.
+
+    Every triangle, and each half of a quad, gets points by its area. Inside they lie uniformly in triangles and
+    parallelograms; in a quad of another shape the density varies as the bilinear map stretches.
 
     Args:
         surface: the surface.

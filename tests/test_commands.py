@@ -225,6 +225,27 @@ def test_fit_of_files_is_that_of_the_library(files, capsys):
     assert json.loads(Path("deep/folder/report.json").read_text()) == found.report().as_dict()
 
 
+@pytest.mark.parametrize(
+    ("options", "scheme", "levels", "max_sweeps"),
+    [
+        ("", js.Interpolating(1.0), 3, 60),
+        ("--h 0.8 --levels 2", js.Interpolating(0.8), 2, 60),
+        ("--scheme circle --h 1.1 --max-sweeps 7", js.CirclePreserving(1.1), 3, 7),
+    ],
+)
+def test_options_of_a_fit_reach_it(files, monkeypatch, options, scheme, levels, max_sweeps):
+    seen = []
+
+    def told(scheme, topology, control, scan, **how):
+        seen.append((scheme, len(topology.levels), how["max_sweeps"]))
+        raise ValueError("seen enough")
+
+    monkeypatch.setattr("fitting.__main__.fit", told)
+    assert run(fit, "scan.xyz", "--control", "control.obj", *options.split()) == 2
+    [(found, *numbers)] = seen
+    assert type(found) is type(scheme) and found.h == scheme.h and numbers == [levels, max_sweeps]
+
+
 def test_fit_that_did_not_converge_is_status_1_and_written_all_the_same(files, capsys):
     assert run(fit, "scan.xyz", "--control", "control.obj", "--levels", 1, "--max-sweeps", 2) == 1
     assert "NOT CONVERGED" in capsys.readouterr().out
