@@ -45,7 +45,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     folder = Path(options.output or f"fit_{Path(options.scan).stem if options.scan else options.example}")
-    folder.mkdir(parents=True, exist_ok=True)
     scan, mesh, name = _inputs(options)
     print(f"scan     {scan.n_points:,} points, {_size(np.asarray(scan.points))}")
     print(f"control  {len(mesh.vertices):,} vertices, {mesh.n_faces:,} faces, {_size(mesh.vertices)}")
@@ -82,6 +81,7 @@ def _inputs(options: argparse.Namespace) -> tuple[Scan, js.ControlMesh, str]:
 
 def _save(folder: Path, result: FitResult, start: js.ControlMesh, name: str) -> None:
     """The fit as files, each complete or not there at all."""
+    folder.mkdir(parents=True, exist_ok=True)
     fitted = js.ControlMesh(result.control.vertices, start.faces, result.control.normals, check=False)
     js.write_mesh(folder / "control.obj", fitted)
     js.write_mesh(folder / "surface.ply", result.surface, vertex_data={"distance_mm": surface_distances(result)})

@@ -124,7 +124,7 @@ def fit(
     if throw and result != optx.RESULTS.successful:
         raise RuntimeError(
             f"the fit did not converge in {len(rms) - 1} sweeps (RMS {rms[0]:.3f} -> {rms[-1]:.3f} mm): "
-            f"{optx.RESULTS[result]} Give more `max_sweeps`, a better start, or throw=False to get what there is."
+            f"{found.report().reason}. Give more `max_sweeps`, a better start, or throw=False to get what there is."
         )
     return found
 

@@ -55,6 +55,10 @@ class Report:
             ("faces of the surface", f"{self.n_faces:,}"),
             ("tangent length h", h),
         ]
+        if self.rms > self.rms_start:
+            rows.append(
+                ("note", "worse than the start: is the control mesh too coarse, or fairness too strong?")
+            )
         width = max(len(name) for name, _ in rows)
         return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
 

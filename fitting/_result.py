@@ -67,7 +67,7 @@ class FitResult:
         """The fit in numbers: `print` it, or take `.as_dict()`."""
         return Report(
             converged=bool(self.result == optx.RESULTS.successful),
-            reason=str(optx.RESULTS[self.result]),
+            reason=_words(self.result),
             sweeps=len(self.rms) - 1,
             rms_start=float(self.rms[0]),
             rms=float(self.rms[-1]),
@@ -89,3 +89,10 @@ class FitResult:
 
 def _rms(distances: Float[np.ndarray, "p"]) -> float:
     return float(np.sqrt(np.mean(distances**2))) if len(distances) else 0.0
+
+
+def _words(result: optx.RESULTS) -> str:
+    """Why the fit stopped, in words; optimistix's own where they are not about its inner steps."""
+    if result == optx.RESULTS.nonlinear_max_steps_reached:
+        return "max_sweeps reached before the distances came to rest"
+    return str(optx.RESULTS[result])

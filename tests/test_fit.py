@@ -541,7 +541,7 @@ def test_report_in_words(noisy):
     assert lines["RMS distance"] == f"{noisy.rms[-1]:.3f} mm (from {noisy.rms[0]:.3f} mm)"
     assert lines["scan points"].startswith("600, ") and lines["tangent length h"] == f"{float(noisy.scheme.h):.4f}"
     cut_off = str(problem().fit(max_sweeps=1).report())
-    assert re.match(r"fit +NOT CONVERGED: .*maximum number of steps", cut_off)
+    assert re.match(r"fit +NOT CONVERGED: .*max_sweeps reached", cut_off)
 
 
 def test_report_of_a_fit_with_one_h_a_level_lists_them():
