@@ -86,8 +86,8 @@ def fit(
     control = js.Control(control.vertices, _given_normals(topology, control))
     surface = js.refine(scheme, topology, control)
     open_vertices, edge = boundary_vertices(surface), float(edge_length(topology, control.vertices))
-    seen = look(surface, scan, open_vertices, edge, loss, np.inf)
-    widest = float(seen.scale)
+    seen = look(surface, scan, open_vertices, edge, loss, 0.0)
+    widest = float(seen.scale)  # a robust scale of the start's own error: outliers must not widen it
     _warn_if_far(float(np.median(np.abs(seen.distances))), control)
     rms, robust_rms, result = [float(seen.rms)], [float(seen.robust_rms)], optx.RESULTS.nonlinear_max_steps_reached
     for sweep in range(max_sweeps):

@@ -16,8 +16,7 @@ from ._residuals import Correspondence
 from ._robust import AbstractLoss, noise_scale
 from ._scan import Scan
 
-# A point beyond an open boundary by this many sigma, or by a control edge, belongs to what the mesh does not cover.
-_BEYOND = 4.0
+_BOUNDARY_SCALE = 1 / 3  # least scale of the loss at an open boundary, in control edges
 _ON_BOUNDARY = 1e-3  # how far, in parts of a face, a surface point may lie from a boundary and count as on it
 
 
@@ -50,7 +49,7 @@ def look(
         open_vertices: which vertices of the surface lie on a boundary.
         edge: length of a control edge in mm.
         loss: how a point loses weight with its distance.
-        floor: the least scale of the loss in mm; infinite for the widest that the distances give.
+        floor: the least scale of the loss in mm.
     """
     at = closest_points(surface, np.asarray(scan.points))
     return _measure(surface, scan, at, open_vertices, edge, loss, jnp.asarray(floor, scan.points.dtype))
@@ -73,11 +72,11 @@ def _measure(
     at_boundary = jnp.sum(jnp.where(open_vertices[corners], inside, 0.0), axis=1) > 1 - _ON_BOUNDARY
     # Beyond a boundary the distance runs along the surface, and says nothing of the noise across it.
     counted = jnp.where(at_boundary, 0.0, given)
-    # An infinite floor asks for the widest scale: every point that is not far beyond the rest counts in full.
-    widest = 3 * jnp.sqrt(jnp.average(distance**2, weights=given))
-    scale = jnp.maximum(noise_scale(distance, counted), jnp.minimum(floor, widest))
-    weights = given * loss.weight(distance / jnp.maximum(scale, jnp.finfo(scale.dtype).tiny))
-    weights = jnp.where(at_boundary & (distance > jnp.minimum(_BEYOND * scale, edge)), 0.0, weights)
+    scale = jnp.maximum(noise_scale(distance, counted), floor)
+    # Near a boundary the surface may have to grow, by up to a control edge: what is farther is not covered by the mesh.
+    at_its_scale = jnp.where(at_boundary, jnp.maximum(scale, edge * _BOUNDARY_SCALE), scale)
+    weights = given * loss.weight(distance / jnp.maximum(at_its_scale, jnp.finfo(scale.dtype).tiny))
+    weights = jnp.where(at_boundary & (distance > edge), 0.0, weights)
     return Look(
         at=at,
         pairs=Correspondence(scan.points, corners, inside, normals, weights / jnp.mean(weights), at_boundary),

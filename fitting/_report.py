@@ -56,9 +56,7 @@ class Report:
             ("tangent length h", h),
         ]
         if self.rms > self.rms_start:
-            rows.append(
-                ("note", "worse than the start: is the control mesh too coarse, or fairness too strong?")
-            )
+            rows.append(("note", "worse than the start: is the control mesh too coarse, or fairness too strong?"))
         width = max(len(name) for name, _ in rows)
         return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
 
