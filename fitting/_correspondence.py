@@ -10,16 +10,27 @@ from jaxsubdiv import RefinedSurface, SurfacePoint
 from jaxsubdiv._half_edges import half_edges
 
 _FIRST_CANDIDATES = 8
+_MORE_CANDIDATES = 4  # times as many, for the points whose closest face is not certain yet
 _PAIRS_AT_ONCE = 2_000_000  # bounds the memory to a few hundred MB, however large scan and surface are
+_LARGE, _MOST_PARTS = 1.5, 24  # times the usual size: a larger triangle stands in the tree in parts, to so many a side
 _QUAD_STEPS = 3
 
 
 class _Triangles(NamedTuple):
-    """Corners of the triangulated surface."""
+    """A corner, and the edges from it to the next corner and to the one before, coordinate by coordinate."""
 
-    a: Float[np.ndarray, "t 3"]
-    b: Float[np.ndarray, "t 3"]
-    c: Float[np.ndarray, "t 3"]
+    a: Float[np.ndarray, "3 t"]
+    ab: Float[np.ndarray, "3 t"]
+    ac: Float[np.ndarray, "3 t"]
+
+
+class _Centres(NamedTuple):
+    """Middles of the triangles, or of equal parts of the large ones."""
+
+    points: Float[np.ndarray, "c 3"]
+    triangle: Int[np.ndarray, "c"]
+    radius: Float[np.ndarray, "c"]
+    """Within which the part lies."""
 
 
 def closest_points(surface: RefinedSurface, points: Float[np.ndarray, "p 3"]) -> SurfacePoint:
@@ -35,9 +46,8 @@ def closest_points(surface: RefinedSurface, points: Float[np.ndarray, "p 3"]) ->
     """
     vertices = np.asarray(surface.vertices, np.float64)
     points = np.asarray(points, np.float64)
-    corners = _Triangles(*(vertices[column] for column in np.asarray(surface.triangles()).T))
-    triangle = _nearest_triangle(corners, points)
-    _, uv = _distance_squared(_Triangles(*(corner[triangle] for corner in corners)), points)
+    a, b, c = (vertices[column].T for column in np.asarray(surface.triangles()).T)
+    triangle, uv = _nearest_triangle(_Triangles(a, b - a, c - a), points)
     face, uv = _to_faces(len(surface.faces[3]), triangle, uv)
     in_quad = np.flatnonzero(face >= len(surface.faces[3]))
     if len(in_quad):
@@ -63,83 +73,85 @@ def nearest_rows(
     return np.reshape(distances, (len(points), k)), np.reshape(rows, (len(points), k))
 
 
-def _nearest_triangle(corners: _Triangles, points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, "p"]:
-    centres = (corners.a + corners.b + corners.c) / 3
-    radii = np.sqrt(np.max([((corner - centres) ** 2).sum(axis=1) for corner in corners], axis=0))
-    reach = radii.max()
-    tree = KDTree(centres)
-    k = min(_FIRST_CANDIDATES, len(centres))
-    nearest, distance = np.zeros(len(points), np.int64), np.zeros(len(points))
-    unsure = []
-    for rows in _chunks(np.full(len(points), k)):
-        to_centre, candidates = nearest_rows(tree, points[rows], k)
-        squared, _ = _distance_squared(_Triangles(*(corner[candidates] for corner in corners)), points[rows][:, None])
-        best, along = squared.argmin(axis=1), np.arange(len(rows))
-        nearest[rows], distance[rows] = candidates[along, best], np.sqrt(squared[along, best])
-        # A triangle lies within `reach` of its centre: where the last centre is farther than that, none was missed.
-        unsure.append(rows[distance[rows] + reach > to_centre[:, -1]])
-    rest = np.concatenate(unsure) if k < len(centres) else np.zeros(0, np.int64)
-    counts = tree.query_ball_point(points[rest], distance[rest] + reach, workers=-1, return_length=True)
-    for part in _chunks(np.asarray(counts)):
-        rows = rest[part]
-        nearest[rows] = _nearest_in_reach(tree, corners, centres, radii, points[rows], distance[rows])
-    return nearest
+def _nearest_triangle(
+    triangles: _Triangles, points: Float[np.ndarray, "p 3"]
+) -> tuple[Int[np.ndarray, "p"], Float[np.ndarray, "p 2"]]:
+    centres = _centres(triangles)
+    tree, reach = KDTree(centres.points), float(centres.radius.max())
+    nearest, uv = np.zeros(len(points), np.int64), np.zeros((len(points), 2))
+    squared = np.full(len(points), np.inf)
+    unsure, k = np.arange(len(points)), min(_FIRST_CANDIDATES, len(centres.points))
+    while len(unsure):
+        left = []
+        for rows in np.array_split(unsure, -(-len(unsure) * k // _PAIRS_AT_ONCE)):
+            to_centre, candidates = nearest_rows(tree, points[rows], k)
+            # A part lies within its radius of its centre: what is farther by more is not worth a look.
+            near = to_centre - centres.radius[candidates] <= np.sqrt(squared[rows])[:, None]
+            point, column = np.nonzero(near)
+            triangle = centres.triangle[candidates[point, column]]
+            found, places = _distance_squared(triangles, triangle, points[rows[point]])
+            order = np.lexsort((found, point))
+            first = order[np.searchsorted(point[order], np.unique(point))]
+            row = rows[point[first]]
+            closer = found[first] < squared[row]
+            row, first = row[closer], first[closer]
+            nearest[row], uv[row], squared[row] = triangle[first], places[first], found[first]
+            # Where the last centre is farther than the closest face and the reach, no face was missed.
+            left.append(rows[np.sqrt(squared[rows]) * (1 + 1e-9) + reach > to_centre[:, -1]])
+        unsure = np.concatenate(left) if k < len(centres.points) else np.zeros(0, np.int64)
+        k = min(_MORE_CANDIDATES * k, len(centres.points))
+    return nearest, uv
 
 
-def _nearest_in_reach(
-    tree: KDTree,
-    corners: _Triangles,
-    centres: Float[np.ndarray, "t 3"],
-    radii: Float[np.ndarray, "t"],
-    points: Float[np.ndarray, "p 3"],
-    distance: Float[np.ndarray, "p"],
-) -> Int[np.ndarray, "p"]:
-    """Nearest triangle, given one that is `distance` off: looks at all that can be nearer."""
-    distance = distance * (1 + 1e-9)  # so that rounding cannot lose the triangle that gave it
-    lists = tree.query_ball_point(points, distance + radii.max(), workers=-1)
-    triangle = np.concatenate([np.asarray(found, np.int64) for found in lists])
-    point = np.repeat(np.arange(len(points)), [len(found) for found in lists])
-    to_centre = np.sqrt(((points[point] - centres[triangle]) ** 2).sum(axis=1))
-    closer = to_centre - radii[triangle] <= distance[point]
-    point, triangle = point[closer], triangle[closer]
-    squared, _ = _distance_squared(_Triangles(*(corner[triangle] for corner in corners)), points[point])
-    order = np.lexsort((squared, point))
-    first = order[np.searchsorted(point[order], np.arange(len(points)))]  # every point still has the one it came with
-    return triangle[first]
-
-
-def _chunks(counts: Int[np.ndarray, "n"]) -> list[Int[np.ndarray, "m"]]:
-    """Rows in runs that hold `_PAIRS_AT_ONCE` pairs or less, or one row each."""
-    if len(counts) == 0:
-        return []
-    run = np.cumsum(counts) // _PAIRS_AT_ONCE
-    return np.split(np.arange(len(counts)), np.flatnonzero(np.diff(run)) + 1)
+def _centres(triangles: _Triangles) -> _Centres:
+    a, ab, ac = (np.ascontiguousarray(rows.T) for rows in triangles)
+    middle = (ab + ac) / 3
+    radius = np.sqrt(np.max([_dot(rows, rows) for rows in (middle, middle - ab, middle - ac)], axis=0))
+    parts = np.clip(np.ceil(radius / max(_LARGE * np.median(radius), np.finfo(float).tiny)), 1, _MOST_PARTS).astype(int)
+    points, owner, sizes = [], [], []
+    for n in np.unique(parts):
+        which = np.flatnonzero(parts == n)
+        i, j = (index.ravel() for index in np.meshgrid(range(n), range(n), indexing="ij"))
+        # Of a triangle cut in n a side: the parts that stand like it, then those upside down.
+        u, v = (np.concatenate([(x + 1 / 3)[i + j < n], (x + 2 / 3)[i + j < n - 1]]) / n for x in (i, j))
+        points.append((a[which, None] + u[:, None] * ab[which, None] + v[:, None] * ac[which, None]).reshape(-1, 3))
+        owner.append(np.repeat(which, len(u)))
+        sizes.append(np.repeat(radius[which] / n, len(u)))
+    return _Centres(np.concatenate(points), np.concatenate(owner), np.concatenate(sizes))
 
 
 def _distance_squared(
-    corners: _Triangles, points: Float[np.ndarray, "*#p 3"]
-) -> tuple[Float[np.ndarray, "*#p"], Float[np.ndarray, "*#p 2"]]:
-    """Squared distance to a triangle, and the place of the closest point: a + u (b - a) + v (c - a)."""
-    ab, ac, ap = corners.b - corners.a, corners.c - corners.a, points - corners.a
-    d00, d01, d11 = _dot(ab, ab), _dot(ab, ac), _dot(ac, ac)
-    d20, d21 = _dot(ap, ab), _dot(ap, ac)
+    triangles: _Triangles, which: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 2"]]:
+    """Squared distance to a triangle each, and the place of the closest point: a + u (b - a) + v (c - a)."""
+    # Coordinate by coordinate: rows of three are slow in numpy.
+    a, ab, ac = (rows[:, which] for rows in triangles)
+    ap = points.T - a
+
+    def dot(x: Float[np.ndarray, "3 n"], y: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "n"]:
+        return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
+
+    d00, d01, d11, d20, d21 = dot(ab, ab), dot(ab, ac), dot(ac, ac), dot(ap, ab), dot(ap, ac)
     area = d00 * d11 - d01 * d01
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = (d11 * d20 - d01 * d21) / area, (d00 * d21 - d01 * d20) / area
+        inside = (u >= 0) & (v >= 0) & (u + v <= 1)  # False where the area is zero
         # Outside, the closest point lies on one of the edges ab, ac, bc; a triangle without area is its edges alone.
         on_ab = np.nan_to_num(np.clip(d20 / d00, 0, 1))
         on_ac = np.nan_to_num(np.clip(d21 / d11, 0, 1))
         on_bc = np.nan_to_num(np.clip((d21 - d20 - d01 + d00) / (d00 - 2 * d01 + d11), 0, 1))
-    zero = np.zeros_like(on_ab)
-    places_u = np.stack([u, on_ab, zero, 1 - on_bc])
-    places_v = np.stack([v, zero, on_ac, on_bc])
-    squared = ((places_u[..., None] * ab + places_v[..., None] * ac - ap) ** 2).sum(axis=-1)
-    inside = (u >= 0) & (v >= 0) & (u + v <= 1)  # False where the area is zero
-    squared[0] = np.where(inside, squared[0], np.inf)
-    best = squared.argmin(axis=0)[None]
-    chosen = (np.take_along_axis(table, best, axis=0)[0] for table in (squared, places_u, places_v))
-    distance, u, v = chosen
-    return distance, np.stack([u, v], axis=-1)
+
+    def squared(u: Float[np.ndarray, "n"], v: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        away = u * ab + v * ac - ap  # not by the products above: their difference has no digits close by
+        return dot(away, away)
+
+    u, v = np.where(inside, u, on_ab), np.where(inside, v, 0.0)
+    best = squared(u, v)
+    for other_u, other_v in ((np.zeros_like(on_ac), on_ac), (1 - on_bc, on_bc)):
+        other = np.where(inside, np.inf, squared(other_u, other_v))
+        closer = other < best
+        u, v, best = np.where(closer, other_u, u), np.where(closer, other_v, v), np.where(closer, other, best)
+    return best, np.stack([u, v], axis=-1)
 
 
 def _to_faces(

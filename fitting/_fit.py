@@ -1,4 +1,4 @@
-"""`fit`: correspondence on the host and Levenberg-Marquardt on the device, in turns."""
+"""`fit`: pairing on the host, derivatives on the device and a sparse solution on the host, in turns."""
 
 import warnings
 from collections.abc import Callable
@@ -6,30 +6,31 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
 import jaxsubdiv as js
-from jaxsubdiv._linalg import unit
+from jaxsubdiv._linalg import dot, unit
 
 from ._correspondence import boundary_vertices
-from ._free import Free, apply_offset, edge_length, no_offset
-from ._look import look
-from ._residuals import Priors, Start, residuals
+from ._free import Free, apply_offset, edge_length
+from ._look import Look, look
+from ._posterior import Problem
+from ._residuals import Priors
 from ._result import FitResult
 from ._robust import AbstractLoss, geman_mcclure
 from ._scan import Scan, ScanError
 
-# Few steps a sweep: with points paired wrongly still, an exact solution would follow the pairing.
-_STEPS_A_SWEEP = 3
-# Inner iterations end at this relative accuracy; a tighter solve costs more than the next sweep gains.
-_LINEAR_TOLERANCE = 1e-3
 # A start that is off by more than this part of the control mesh's size is not roughly aligned.
 _FAR = 0.05
 # Scans in metres against a mesh in mm differ by 1000; a partial scan of the anatomy by much less than this.
 _UNIT_RATIO = 20.0
+# The least noise, in control edges: a perfect scan would have none, and its points infinite weight.
+_LEAST_NOISE = 1e-6
+# Movements far below a control edge are at rest, however exact the scan.
+_AT_REST = 0.01
+_MOST = 0.9  # of the surface: so much of it has to be at rest
 
 
 class Sweep(NamedTuple):
@@ -38,6 +39,8 @@ class Sweep(NamedTuple):
     number: int
     rms: float
     """Root mean square distance in mm, every point by its robust weight."""
+    moved: float
+    """How far the surface moved, across itself: nine tenths of it by less than this, in mm."""
 
 
 def fit(
@@ -50,16 +53,17 @@ def fit(
     priors: Priors | None = None,
     loss: AbstractLoss | None = None,
     max_sweeps: int = 60,
-    tolerance: float = 2e-3,
+    tolerance: float = 0.25,
     throw: bool = True,
     on_sweep: Callable[[Sweep], None] | None = None,
 ) -> FitResult:
     """Fit a control mesh, its normals and h to a scan, so that the refined surface passes through the points.
 
-    Every sweep pairs each scan point with the closest point of the surface, then takes a few Levenberg-Marquardt steps
-    on the distances, most of all those across the surface, and on the priors. Points far out beyond the noise lose
-    weight by a robust loss, whose scale is the noise that the distances show; it falls to that from a large one, sweep
-    by sweep (graduated non-convexity), so that a start that is far off is not taken for outliers.
+    Every sweep pairs each scan point with the closest point of the surface, and takes a Gauss-Newton step, exactly
+    solved, on the distances across the surface and on the priors. Points far out beyond the noise lose weight by a
+    robust loss, whose scale is the noise that the distances show; it falls to that from a large one, sweep by sweep
+    (graduated non-convexity), so that a start that is far off is not taken for outliers. How smooth the surface is
+    follows from the scan, unless the priors say it.
 
     Args:
         scheme: the scheme; its h is where the fit starts.
@@ -67,10 +71,12 @@ def fit(
         control: where the fit starts, roughly aligned with the scan and in mm.
         scan: the measured points in mm.
         free: what may move; default: all of `Free()`.
-        priors: strengths of what is known beforehand; default: `Priors()`.
+        priors: what is known of the surface beforehand; default: `Priors()`.
         loss: how a point loses weight with its distance; default: `geman_mcclure()`.
         max_sweeps: how many sweeps at most.
-        tolerance: converged once a sweep, annealed, changes the robust RMS distance by less than this part of it.
+        tolerance: converged once a sweep, annealed, moves nine tenths of the surface, and the RMS distance, by less
+            than this part of the surface's uncertainty, which is about noise / sqrt(points a control vertex); or of a
+            hundredth of a control edge, where that is more.
         throw: raise where the fit did not converge, or return the reason in `FitResult.result`.
         on_sweep: called after every sweep, for progress.
 
@@ -86,26 +92,28 @@ def fit(
     control = js.Control(control.vertices, _given_normals(topology, control))
     surface = js.refine(scheme, topology, control)
     open_vertices, edge = boundary_vertices(surface), float(edge_length(topology, control.vertices))
-    seen = look(surface, scan, open_vertices, edge, loss, 0.0)
+    seen = look(surface, scan, open_vertices, edge, loss, _LEAST_NOISE * edge)
     widest = float(seen.scale)  # a robust scale of the start's own error: outliers must not widen it
     _warn_if_far(float(np.median(np.abs(seen.distances))), control)
     rms, robust_rms, result = [float(seen.rms)], [float(seen.robust_rms)], optx.RESULTS.nonlinear_max_steps_reached
+    problem = Problem(scheme, topology, control, free, priors)
     for sweep in range(max_sweeps):
-        fairness = priors.fairness_in(sweep)
-        proposed = _sweep(free, Start(scheme, topology, control, seen.pairs, priors, fairness))
+        proposed = _apply(topology, scheme, control, problem.step(scheme, control, seen))
         refined = js.refine(proposed[0], topology, proposed[1])
         if not np.isfinite(refined.vertices).all():
             result = optx.RESULTS.nonfinite  # what the last sound sweep found is what comes back
             break
+        moved = float(_moved(surface, refined))
         (scheme, control), surface = proposed, refined
-        floor = widest * 0.5 ** (sweep + 1)
+        floor = max(widest * 0.5 ** (sweep + 1), _LEAST_NOISE * edge)
         seen = look(surface, scan, open_vertices, edge, loss, floor)
         rms.append(float(seen.rms))
         robust_rms.append(float(seen.robust_rms))
         if on_sweep is not None:
-            on_sweep(Sweep(sweep + 1, robust_rms[-1]))
-        annealed = fairness <= priors.fairness and floor <= seen.scale
-        if annealed and abs(robust_rms[-2] - robust_rms[-1]) <= tolerance * robust_rms[-1]:
+            on_sweep(Sweep(sweep + 1, robust_rms[-1], moved))
+        annealed = problem.annealed and floor <= seen.scale
+        at_rest = tolerance * max(_uncertainty(seen, control), _AT_REST * edge)
+        if annealed and max(moved, abs(robust_rms[-1] - robust_rms[-2])) <= at_rest:
             result = optx.RESULTS.successful
             break
     found = FitResult(
@@ -118,7 +126,7 @@ def fit(
         weights=np.asarray(seen.weights),
         rms=np.array(rms),
         robust_rms=np.array(robust_rms),
-        noise=float(seen.scale),
+        noise=float(seen.noise),
         result=result,
     )
     if throw and result != optx.RESULTS.successful:
@@ -129,21 +137,22 @@ def fit(
     return found
 
 
+_apply = eqx.filter_jit(apply_offset)
+
+
 @eqx.filter_jit
-def _sweep(free: Free, start: Start) -> tuple[js.AbstractScheme, js.Control]:
-    """A few steps of Levenberg-Marquardt at fixed correspondence; matrix-free, so that memory stays linear."""
-    solver = optx.LevenbergMarquardt(
-        rtol=1e-6, atol=1e-6, linear_solver=lx.LSMR(rtol=_LINEAR_TOLERANCE, atol=_LINEAR_TOLERANCE)
-    )
-    offset = optx.least_squares(
-        residuals,
-        solver,
-        no_offset(free, start.scheme, start.control),
-        args=start,
-        max_steps=_STEPS_A_SWEEP,
-        throw=False,
-    ).value
-    return apply_offset(start.topology, start.scheme, start.control, offset)
+def _moved(before: js.RefinedSurface, after: js.RefinedSurface) -> Float[Array, ""]:
+    """How far a surface moved across itself: nine tenths of its vertices by less than this.
+
+    The rest may be where the control mesh is too coarse for the scan, and points change sides for ever.
+    """
+    return jnp.quantile(jnp.abs(dot(after.normals, after.vertices - before.vertices)), _MOST)
+
+
+def _uncertainty(seen: Look, control: js.Control) -> float:
+    """About how well the scan determines the surface, in mm."""
+    counted = max(float(np.sum(np.asarray(seen.weights) > 0)), 1.0)
+    return float(seen.scale) * (control.vertices.shape[0] / counted) ** 0.5
 
 
 def _given_normals(topology: js.Topology, control: js.Control) -> Float[Array, "v 3"]:

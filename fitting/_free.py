@@ -2,7 +2,8 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 import jaxsubdiv as js
 from jaxsubdiv._linalg import Rows, cross, norm, take, unit
@@ -12,39 +13,74 @@ class Free(eqx.Module):
     """What a fit may change.
 
     Attributes:
-        vertices: the control vertices.
-        normals: the directions of the control normals.
+        vertices: the control vertices: all, none, or those where a mask `[v]` is True.
+        normals: the directions of the control normals, likewise.
         h: the tangent length coefficient, one or one a level, as the scheme has it.
+
+    What a scheme does not have, or does not look at, is not free.
+
+    Raises:
+        ValueError: nothing is free, or a mask is no array of booleans.
     """
 
-    vertices: bool = eqx.field(static=True, default=True)
-    normals: bool = eqx.field(static=True, default=True)
-    h: bool = eqx.field(static=True, default=True)
+    vertices: bool | Bool[np.ndarray, "v"] = eqx.field(default=True)
+    normals: bool | Bool[np.ndarray, "v"] = eqx.field(default=True)
+    h: bool = eqx.field(default=True)
 
     def __check_init__(self):
-        if not (self.vertices or self.normals or self.h):
+        for name, mask in (("vertices", self.vertices), ("normals", self.normals)):
+            if not isinstance(mask, bool) and (
+                not isinstance(mask, np.ndarray) or mask.dtype != bool or mask.ndim != 1
+            ):
+                raise ValueError(f"`{name}` must be True, False or a numpy array of booleans, one a control vertex.")
+        if not (np.any(self.vertices) or np.any(self.normals) or self.h):
             raise ValueError("nothing is free: let at least one of vertices, normals and h be True.")
+
+    def of(self, scheme: js.AbstractScheme, n_vertices: int) -> "Unknowns":
+        """Masks in the place of the unknowns; None where a whole array stays.
+
+        Raises:
+            ValueError: a mask has not one row a control vertex, or the scheme has nothing that is free.
+        """
+        uses_normals = getattr(scheme, "uses_normals", True)
+
+        def mask(name: str, of: bool | Bool[np.ndarray, "v"], width: int) -> Array | None:
+            if not np.any(of):
+                return None
+            rows = np.full(n_vertices, of) if isinstance(of, bool) else of
+            if len(rows) != n_vertices:
+                raise ValueError(f"`Free.{name}` has {len(rows)} rows for {n_vertices} control vertices.")
+            return jnp.repeat(jnp.asarray(rows)[:, None], width, axis=1)
+
+        found = Unknowns(
+            mask("vertices", self.vertices, 3),
+            mask("normals", self.normals, 2) if uses_normals else None,
+            jnp.ones(scheme.h.shape, bool) if self.h and scheme.h is not None else None,
+        )
+        if found.vertices is None and found.normals is None and found.h is None:
+            raise ValueError(
+                f"nothing is free: {type(scheme).__name__} has neither normals nor h. Let vertices be True."
+            )
+        return found
 
 
 class Unknowns(eqx.Module):
-    """Offsets from where a sweep starts, each scaled so that 1 moves the surface by about 1 mm.
+    """Offsets from where a sweep starts, each scaled so that 1 moves the surface by about 1 mm; or which are free."""
 
-    Levenberg-Marquardt damps all unknowns alike, so they have to be alike.
-    """
-
-    vertices: Float[Array, "v 3"] | None
-    normals: Float[Array, "v 2"] | None
+    vertices: Float[Array, "v 3"] | Bool[Array, "v 3"] | None
+    normals: Float[Array, "v 2"] | Bool[Array, "v 2"] | None
     """Along two tangents of the unit sphere at the normal: its length is no unknown."""
-    h: Float[Array, "..."] | None
+    h: Float[Array, "..."] | Bool[Array, "..."] | None
 
 
 def no_offset(free: Free, scheme: js.AbstractScheme, control: js.Control) -> Unknowns:
-    """The start of a sweep."""
+    """The start of a sweep. An array of which a part is free has offsets for all of it; the masks say which count."""
     dtype = control.vertices.dtype
+    masks = free.of(scheme, control.vertices.shape[0])
     return Unknowns(
-        jnp.zeros_like(control.vertices) if free.vertices else None,
-        jnp.zeros_like(control.vertices[:, :2]) if free.normals else None,
-        jnp.zeros_like(scheme.h, dtype=dtype) if free.h else None,
+        None if masks.vertices is None else jnp.zeros(masks.vertices.shape, dtype),
+        None if masks.normals is None else jnp.zeros(masks.normals.shape, dtype),
+        None if masks.h is None else jnp.zeros(masks.h.shape, dtype),
     )
 
 

@@ -8,16 +8,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 import jaxsubdiv as js
-from jaxsubdiv._linalg import dot, norm
+from jaxsubdiv._linalg import dot, norm, unit
 from jaxsubdiv._surface import corner_weights
 
 from ._correspondence import closest_points
-from ._residuals import Correspondence
+from ._residuals import Pairs
 from ._robust import AbstractLoss, noise_scale
 from ._scan import Scan
 
 _BOUNDARY_SCALE = 1 / 3  # least scale of the loss at an open boundary, in control edges
 _ON_BOUNDARY = 1e-3  # how far, in parts of a face, a surface point may lie from a boundary and count as on it
+_ON_SURFACE = 1e-6  # in control edges: a point that is closer is on the surface, in no direction from it
+_LEAST_COSINE = 0.5  # between a scan's normal and the surface's: beyond 60 degrees it is the other side of something
 
 
 class Look(NamedTuple):
@@ -25,10 +27,15 @@ class Look(NamedTuple):
 
     at: js.SurfacePoint
     """The surface point closest to every scan point."""
-    pairs: Correspondence
+    pairs: Pairs
     distances: Float[Array, "p"]
     """Signed, positive outside."""
     weights: Float[Array, "p"]
+    """Given weight times the robust one."""
+    precisions: Float[Array, "p"]
+    """1 / variance of every distance, in 1/mm^2, as far as the point counts."""
+    noise: Float[Array, ""]
+    """Standard deviation of the Gaussian part of the distances."""
     scale: Float[Array, ""]
     """Of the robust loss: the noise, or what the annealing keeps it at."""
     rms: Float[Array, ""]
@@ -52,7 +59,8 @@ def look(
         floor: the least scale of the loss in mm.
     """
     at = closest_points(surface, np.asarray(scan.points))
-    return _measure(surface, scan, at, open_vertices, edge, loss, jnp.asarray(floor, scan.points.dtype))
+    edge_and_floor = (jnp.asarray(value, scan.points.dtype) for value in (edge, floor))
+    return _measure(surface, scan, at, open_vertices, *edge_and_floor, loss)
 
 
 @jax.jit
@@ -61,28 +69,39 @@ def _measure(
     scan: Scan,
     at: js.SurfacePoint,
     open_vertices: Bool[Array | np.ndarray, "v"],
-    edge: float | Float[Array, ""],
-    loss: AbstractLoss,
+    edge: Float[Array, ""],
     floor: Float[Array, ""],
+    loss: AbstractLoss,
 ) -> Look:
     on, normals = js.evaluate(surface, at)
     away = scan.points - on
-    distance, given = norm(away)[:, 0], scan.weights_or_ones()
+    distance, given, spread = norm(away)[:, 0], scan.weights_or_ones(), scan.relative_deviations()
     corners, inside = corner_weights(surface, at)
     at_boundary = jnp.sum(jnp.where(open_vertices[corners], inside, 0.0), axis=1) > 1 - _ON_BOUNDARY
+    if scan.normals is not None:
+        given = jnp.where(dot(unit(scan.normals), normals)[:, 0] < _LEAST_COSINE, 0.0, given)
     # Beyond a boundary the distance runs along the surface, and says nothing of the noise across it.
-    counted = jnp.where(at_boundary, 0.0, given)
-    scale = jnp.maximum(noise_scale(distance, counted), floor)
+    noise = noise_scale(distance / spread, jnp.where(at_boundary, 0.0, given))
+    scale = jnp.maximum(noise, floor)
     # Near a boundary the surface may have to grow, by up to a control edge: what is farther is not covered by the mesh.
-    at_its_scale = jnp.where(at_boundary, jnp.maximum(scale, edge * _BOUNDARY_SCALE), scale)
-    weights = given * loss.weight(distance / jnp.maximum(at_its_scale, jnp.finfo(scale.dtype).tiny))
+    at_its_scale = jnp.where(at_boundary, jnp.maximum(scale, edge * _BOUNDARY_SCALE), scale * spread)
+    weights = given * loss.weight(distance / at_its_scale)
     weights = jnp.where(at_boundary & (distance > edge), 0.0, weights)
+    # The derivative of a distance is along it: across the face, or from the edge or boundary that is closest.
+    directions = jnp.where(distance[:, None] > edge * _ON_SURFACE, unit(away), normals)
     return Look(
         at=at,
-        pairs=Correspondence(scan.points, corners, inside, normals, weights / jnp.mean(weights), at_boundary),
+        pairs=Pairs(scan.points, corners, inside, directions),
         distances=jnp.where(dot(normals, away)[:, 0] < 0, -distance, distance),
         weights=weights,
+        precisions=weights / jnp.mean(scan.weights_or_ones()) / (scale * spread) ** 2,
+        noise=noise,
         scale=scale,
-        rms=jnp.sqrt(jnp.average(distance**2, weights=given)),
-        robust_rms=jnp.sqrt(jnp.average(distance**2, weights=weights)),
+        rms=_mean_root(distance, scan.weights_or_ones()),
+        robust_rms=_mean_root(distance, weights),
     )
+
+
+def _mean_root(distance: Float[Array, "p"], weights: Float[Array, "p"]) -> Float[Array, ""]:
+    total = jnp.sum(weights)
+    return jnp.sqrt(jnp.sum(weights * distance**2) / jnp.where(total > 0, total, 1.0))

@@ -1,56 +1,80 @@
-"""Residuals, each a vector in mm: the distance to the scan, and what is known of surfaces beforehand."""
+"""What a fit makes small, row by row: distances to the scan, and what is known of surfaces beforehand.
+
+Every row is over the standard deviation that is expected of it, so that half the squared sum of all is the negative
+logarithm of a probability: of the scan given the surface, times that of the surface.
+"""
 
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 import jaxsubdiv as js
 from jaxsubdiv._control import strong_float
-from jaxsubdiv._linalg import dot, take
+from jaxsubdiv._linalg import cross, dot, norm, take, unit
 from jaxsubdiv._surface import sum_corners
 
-from ._free import Unknowns, apply_offset, edge_length, h_effect
+from ._free import Unknowns, apply_offset, edge_length
 
-_DAMPING = 0.01
+# A normal that leans less than this, as a cosine, from the faces around it keeps the surface smooth; it may be a little
+# under it, by the softness, at a standard deviation of the spread.
+_MARGIN, _MARGIN_SOFTNESS, _MARGIN_SPREAD = 0.2, 0.1, 0.02
+
+
+def _positive(value: object) -> Float[Array, ""]:
+    value = strong_float(value)
+    if not bool(value > 0):
+        raise ValueError(f"a standard deviation must be positive; got {value}. Give jnp.inf to leave a prior out.")
+    return value
 
 
 class Priors(eqx.Module):
-    """What is known of a surface before it is measured, each as a weight beside the mean square distance to the scan.
+    """What is known of a surface before it is measured, each as the standard deviation that is expected.
+
+    A prior of the standard deviation `jnp.inf` is left out.
 
     Attributes:
-        fairness: of the mean square bend asymmetry (see `bend_asymmetry`) in the last sweeps.
-        fairness_start: the same in the first sweep. It halves from sweep to sweep: a stiff start finds its way past
-            noise in the control mesh, a soft end follows the scan.
-        h: of the displacement that h - 1 stands for, squared.
-        along: of the distance along the surface, beside that across it. It holds the control vertices in their places;
-            the rest slides freely, so that the last sweeps converge fast. At an open boundary it is 1.
+        bend: of the bend asymmetry of an edge in mm (see `bend_asymmetry`): small is smooth. None, the default: found
+            from the scan, place by place, as that which makes the scan most probable (see `_evidence`).
+        stretch: of the change of a control edge along the surface, against the control mesh where the fit starts, as a
+            part of the edge's length. It keeps the control vertices in their places where the scan does not.
+        h: of the tangent length coefficient about 1.
+
+    Raises:
+        ValueError: a standard deviation is not positive.
     """
 
-    fairness: Float[Array, ""] = eqx.field(converter=strong_float, default=0.01)
-    fairness_start: Float[Array, ""] = eqx.field(converter=strong_float, default=1.0)
-    h: Float[Array, ""] = eqx.field(converter=strong_float, default=0.1)
-    along: Float[Array, ""] = eqx.field(converter=strong_float, default=0.003)
-
-    def fairness_in(self, sweep: int) -> Float[Array, ""]:
-        """The weight of fairness in a sweep, counted from 0."""
-        return jnp.maximum(self.fairness, self.fairness_start * 0.5**sweep)
+    bend: Float[Array, ""] | None = eqx.field(
+        converter=lambda value: None if value is None else _positive(value), default=None
+    )
+    stretch: Float[Array, ""] = eqx.field(converter=_positive, default=0.2)
+    h: Float[Array, ""] = eqx.field(converter=_positive, default=0.05)
 
 
-class Correspondence(NamedTuple):
+class Pairs(NamedTuple):
     """Scan points and the surface points paired with them, as one sweep holds them fixed."""
 
     points: Float[Array, "p 3"]
     corners: Int[Array, "p 4"]
     """Vertices of the refined surface around each surface point."""
     corner_weights: Float[Array, "p 4"]
-    normals: Float[Array, "p 3"]
-    """Normals of the surface there."""
-    weights: Float[Array, "p"]
-    """Weights of the pairs, of mean 1."""
-    at_boundary: Bool[Array, "p"]
-    """Whether the surface ends there: then the whole distance counts, for the surface may have to grow."""
+    directions: Float[Array, "p 3"]
+    """Unit vectors along which the distance is measured, from the surface to the point: the surface slides freely
+    across them."""
+
+
+class Anchors(NamedTuple):
+    """Landmarks: places of the surface, and where the scan has them."""
+
+    points: Float[Array, "l 3"]
+    face: Int[Array, "l"]
+    corners: Int[Array, "l 4"]
+    corner_weights: Float[Array, "l 4"]
+    deviations: Float[Array, "l"]
+    """Standard deviations in mm."""
 
 
 class Start(NamedTuple):
@@ -59,50 +83,140 @@ class Start(NamedTuple):
     scheme: js.AbstractScheme
     topology: js.Topology
     control: js.Control
-    pairs: Correspondence
-    priors: Priors
-    fairness: Float[Array, ""]
+    template: Float[Array, "v 3"]
+    """Control vertices of the template, moved to `control` as a whole: what edges are compared with."""
+    anchors: Anchors | None
 
 
-def residuals(offset: Unknowns, start: Start) -> tuple[Array, ...]:
-    """Everything whose mean square a sweep makes small; no distances, so that a perfect fit has a gradient too."""
+class Rows(NamedTuple):
+    """Residuals before they are weighed; in mm where nothing else is said."""
+
+    distance: Float[Array, "p"]
+    bend: Float[Array, "b"]
+    stretch: Float[Array, "s"]
+    """Three a control edge, as parts of its length."""
+    margin: Float[Array, "c"]
+    """One a corner of the control faces, over its own standard deviation."""
+    landmark: Float[Array, "l"]
+    """Three a landmark, over its standard deviation."""
+    h: Float[Array, "n"]
+    """h - 1."""
+
+
+def residuals(offset: Unknowns, start: Start, pairs: Pairs) -> Rows:
+    """All rows at an offset from the start; no distances, so that a perfect fit has a derivative too."""
     scheme, control = apply_offset(start.topology, start.scheme, start.control, offset)
     surface = js.refine(scheme, start.topology, control)
+    away = sum_corners(surface.vertices, pairs.corners, pairs.corner_weights) - pairs.points
     dtype = surface.vertices.dtype
-    away = sum_corners(surface.vertices, start.pairs.corners, start.pairs.corner_weights) - start.pairs.points
-    root = jnp.sqrt(start.pairs.weights)[:, None]
-    along = jnp.sqrt(jnp.where(start.pairs.at_boundary, 1.0, start.priors.along.astype(dtype)))[:, None]
-    asymmetry = bend_asymmetry(start.topology, surface)
-    bend = h_effect(edge_length(start.topology, start.control.vertices)) * (scheme.h.astype(dtype) - 1)
-    # optimistix starts with the damping 1, whatever the residuals: scaled by this, the mean square over the scan gives
-    # each control vertex 1 / _DAMPING on the diagonal of the normal equations.
-    scale = start.control.vertices.shape[0] / _DAMPING
-    return (
-        _mean(root * dot(start.pairs.normals, away), scale),
-        _mean(root * along * away, scale),
-        *(_mean(level, scale * start.fairness.astype(dtype)) for level in asymmetry),
-        _mean(bend[None], scale * start.priors.h.astype(dtype)),
+    none = jnp.zeros((0,), dtype)
+    return Rows(
+        distance=dot(pairs.directions, away)[:, 0],
+        bend=bend_asymmetry(start.topology, surface),
+        stretch=_stretch(start, control),
+        margin=_margin_rows(start.topology, control),
+        landmark=none if start.anchors is None else _anchor_rows(start.anchors, surface),
+        h=none if offset.h is None else jnp.atleast_1d(scheme.h).astype(dtype) - 1,
     )
 
 
-def bend_asymmetry(topology: js.Topology, surface: js.RefinedSurface) -> tuple[Float[Array, "e 1"], ...]:
+def bend_asymmetry(topology: js.Topology, surface: js.RefinedSurface) -> Float[Array, "b"]:
     """By how much the surface bends more at one end of an edge than at the other, in mm, edge by edge.
 
     It is half of the height of each end over the tangent plane at the other, one less the other:
     (n_a + n_b) . (x_b - x_a) / 2. It vanishes on spheres, on cylinders and for every circular arc, so that it smooths
     without shrinking; and it ties normals to the geometry, for a normal that leans bends its edges unevenly.
 
-    Taken over the control edges, and over the edges of the first level where there is one to spare.
+    Taken over the edges of the first level, or the control edges where there is one level only.
     """
-
-    def of(level: int) -> Float[Array, "e 1"]:
-        a, b = topology.levels[level].edges.T
-        d = take(surface.vertices, b) - take(surface.vertices, a)
-        return 0.5 * dot(take(surface.normals, a) + take(surface.normals, b), d)
-
-    return tuple(of(level) for level in range(min(2, len(topology.levels))))
+    a, b = bend_edges(topology).T
+    d = take(surface.vertices, b) - take(surface.vertices, a)
+    return 0.5 * dot(take(surface.normals, a) + take(surface.normals, b), d)[:, 0]
 
 
-def _mean(rows: Float[Array, "n *k"], weight: Float[Array, ""] | float) -> Float[Array, "n *k"]:
-    """Rows whose squared sum is `weight` times the mean square of the rows given."""
-    return rows * jnp.sqrt(weight / rows.shape[0])
+def bend_edges(topology: js.Topology) -> Int[Array, "b 2"]:
+    """The edges whose bends are compared."""
+    return topology.levels[min(1, len(topology.levels) - 1)].edges
+
+
+def _stretch(start: Start, control: js.Control) -> Float[Array, "s"]:
+    a, b = start.topology.levels[0].edges.T
+
+    def along(rows: Float[Array, "v 3"]) -> Float[Array, "e 3"]:
+        return take(rows, b) - take(rows, a)
+
+    change = along(control.vertices) - along(start.template)
+    n = start.control.normals
+    across = unit(take(n, a) + take(n, b))
+    length = jnp.maximum(norm(along(start.template)), 1e-3 * edge_length(start.topology, start.template))
+    return ((change - dot(across, change) * across) / length).reshape(-1)
+
+
+def _anchor_rows(anchors: Anchors, surface: js.RefinedSurface) -> Float[Array, "l"]:
+    on = sum_corners(surface.vertices, anchors.corners, anchors.corner_weights)
+    return ((on - anchors.points) / anchors.deviations[:, None]).reshape(-1)
+
+
+def _margin_rows(topology: js.Topology, control: js.Control) -> Float[Array, "c"]:
+    rows = []
+    for size, faces in sorted(topology.control_faces.items()):
+        for corner in range(size):
+            at, after, before = (faces[:, (corner + step) % size] for step in (0, 1, -1))
+            centre = take(control.vertices, at)
+            face_normal = unit(cross(take(control.vertices, after) - centre, take(control.vertices, before) - centre))
+            rows.append(dot(unit(take(control.normals, at)), face_normal)[:, 0])
+    margin = jnp.concatenate(rows)
+    return jax.nn.softplus((_MARGIN - margin) / _MARGIN_SOFTNESS) * (_MARGIN_SOFTNESS / _MARGIN_SPREAD)
+
+
+class RowFaces(NamedTuple):
+    """The control face that every row lies in. Field by field as `Rows`."""
+
+    distance: Int[np.ndarray, "p"]
+    bend: Int[np.ndarray, "b"]
+    stretch: Int[np.ndarray, "s"]
+    margin: Int[np.ndarray, "c"]
+    landmark: Int[np.ndarray, "l"]
+    h: Int[np.ndarray, "n"]
+
+
+def prior_faces(topology: js.Topology, anchors: Anchors | None, n_h: int) -> RowFaces:
+    """The faces of all rows but the distances'."""
+    triangles, quads = (np.asarray(topology.control_faces[size]) for size in (3, 4))
+    of_edge = _faces_of_edges(np.asarray(topology.levels[0].edges), triangles, quads)
+    # As `build_topology` lays out the edges of a level: halves of the parents', three in each triangle, four in a quad.
+    inner = (np.repeat(np.arange(len(triangles)), 3), np.repeat(len(triangles) + np.arange(len(quads)), 4))
+    finer = np.concatenate([np.repeat(of_edge, 2), *inner])
+    corners = [np.tile(np.arange(len(triangles)), 3), np.tile(len(triangles) + np.arange(len(quads)), 4)]
+    at = np.zeros(0, int) if anchors is None else control_face(topology, np.asarray(anchors.face))
+    return RowFaces(
+        distance=np.zeros(0, int),
+        bend=of_edge if len(topology.levels) == 1 else finer,
+        stretch=np.repeat(of_edge, 3),
+        margin=np.concatenate(corners),
+        landmark=np.repeat(at, 3),
+        h=np.zeros(n_h, int),
+    )
+
+
+def control_face(topology: js.Topology, face: Int[np.ndarray, "p"]) -> Int[np.ndarray, "p"]:
+    """The control face that a face of the last level descends from."""
+    return face // 4 ** len(topology.levels)
+
+
+def _faces_of_edges(
+    edges: Int[np.ndarray, "e 2"], triangles: Int[np.ndarray, "t 3"], quads: Int[np.ndarray, "q 4"]
+) -> Int[np.ndarray, "e"]:
+    """A face at every edge."""
+    sides = [np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2) for faces in (triangles, quads)]
+    owner = np.concatenate(
+        [np.repeat(np.arange(len(triangles)), 3), np.repeat(len(triangles) + np.arange(len(quads)), 4)]
+    )
+
+    def key(pairs: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
+        low_high = np.sort(pairs.astype(np.int64), axis=1)
+        return low_high[:, 0] << 32 | low_high[:, 1]
+
+    keys = key(np.concatenate(sides))
+    order = np.argsort(keys, kind="stable")
+    return owner[order[np.searchsorted(keys[order], key(edges))]]

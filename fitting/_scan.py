@@ -27,14 +27,18 @@ class Scan(eqx.Module):
         points: positions in mm.
         normals: outward normals of any length, or None.
         weights: how much each point counts, not negative, or None where all count alike.
+        deviations: standard deviation of each point's distance, positive, or None where all are alike. Only their ratio
+            counts: how large the noise is, the fit finds out.
 
     Raises:
-        ScanError: there is no point, a value is not finite, a weight is negative, or lengths differ.
+        ScanError: there is no point, a value is not finite, a weight is negative, a deviation is not positive, or
+            lengths differ.
     """
 
     points: Float[Array, "p 3"] = eqx.field(converter=strong_float)
     normals: Float[Array, "p 3"] | None = eqx.field(converter=_optional, default=None)
     weights: Float[Array, "p"] | None = eqx.field(converter=_optional, default=None)
+    deviations: Float[Array, "p"] | None = eqx.field(converter=_optional, default=None)
 
     def __check_init__(self):
         if self.points.ndim != 2 or self.points.shape[-1] != 3 or len(self.points) == 0:
@@ -43,6 +47,7 @@ class Scan(eqx.Module):
             ("points", self.points, self.points.shape),
             ("normals", self.normals, self.points.shape),
             ("weights", self.weights, self.points.shape[:1]),
+            ("deviations", self.deviations, self.points.shape[:1]),
         ):
             if values is None:
                 continue
@@ -58,6 +63,13 @@ class Scan(eqx.Module):
             if not float(self.weights.sum()) > 0:
                 raise ScanError("all `weights` are 0: nothing is left to fit. Give None where all points count alike.")
 
+        if self.deviations is not None:
+            bad = np.flatnonzero(np.asarray(self.deviations) <= 0)
+            if len(bad):
+                raise ScanError(
+                    f"`deviations` are not positive in rows {name_rows(bad)}. Give a weight of 0 to ignore a point."
+                )
+
     @property
     def n_points(self) -> int:
         """Number of points."""
@@ -66,6 +78,12 @@ class Scan(eqx.Module):
     def weights_or_ones(self) -> Float[Array, "p"]:
         """The weights, 1 each where there are none."""
         return jnp.ones_like(self.points[:, 0]) if self.weights is None else self.weights
+
+    def relative_deviations(self) -> Float[Array, "p"]:
+        """The deviations over their root mean square, 1 each where there are none."""
+        if self.deviations is None:
+            return jnp.ones_like(self.points[:, 0])
+        return self.deviations / jnp.sqrt(jnp.mean(self.deviations**2))
 
 
 def read_scan(path: str | Path, *, scale: float = 1.0) -> Scan:

@@ -1,0 +1,216 @@
+"""Normal equations of a fit, assembled as in finite elements: a control face is an element.
+
+The surface over a control face depends on few control vertices: its own, and those of the faces around it. All
+derivatives of all rows are therefore found by few forward derivatives, each along many control vertices at once that
+have no face in common (Curtis, Powell and Reid, On the estimation of sparse Jacobian matrices, 1974), and the normal
+equations are sums of small dense matrices, one a face. Which vertices belong to which face is analysed once.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Array, Float, Int, Shaped
+
+import jaxsubdiv as js
+
+from ._free import Free, Unknowns, no_offset
+from ._residuals import Pairs, Rows, Start, residuals
+
+_ROWS_A_BLOCK = 32
+_PAIRS_AT_ONCE = 65_536  # bounds the memory to a few hundred MB, however large the scan is
+_WRONG = 1e-3  # of a derivative: far more than rounding in float32, far less than a forgotten control vertex
+
+
+class Elements(NamedTuple):
+    """Which unknowns the rows of each control face depend on. Unknowns are numbered vertex by vertex, then h."""
+
+    columns: Int[np.ndarray, "f d"]
+    """Unknowns of every face; `n` where there are fewer than in other faces."""
+    seeds_of: Int[np.ndarray, "f d"]
+    """The seed that each of them moves in."""
+    seeds: Unknowns
+    """Directions, one a leading row: many unknowns at once, no two of them in one face. The last is at random."""
+    pattern: sp.csc_array
+    """Of the normal equations; its values are where in `pattern` each entry is."""
+    places: Int[np.ndarray, "f d d"]
+    """Entry of the pattern for every two unknowns of a face; one beyond the last where there is none."""
+    n: int
+    """Number of unknowns."""
+
+
+class Derivatives(NamedTuple):
+    """Rows and their derivatives by the unknowns of the face that each lies in."""
+
+    values: Float[np.ndarray, "m"]
+    by: Float[np.ndarray, "m d"]
+
+
+def find_elements(topology: js.Topology, free: Free, start: Start, rings: int) -> Elements:
+    """Analyse which unknowns belong together, if a face depends on the vertices of `rings` rings of faces around it."""
+    n_vertices = topology.n_control_vertices
+    near = _vertices_near_faces(topology, rings)
+    colour = _colour(near)
+    zero = no_offset(free, start.scheme, start.control)
+    per_vertex = sum(part.shape[1] for part in (zero.vertices, zero.normals) if part is not None)
+    n_h = 0 if zero.h is None else zero.h.size
+    n = n_vertices * per_vertex + n_h
+    n_colours = int(colour.max()) + 1
+
+    counts, n_faces = np.diff(near.indptr), len(near.indptr) - 1
+    slot = np.arange(near.indptr[-1]) - np.repeat(near.indptr[:-1], counts)
+    vertices = np.full((n_faces, counts.max()), -1)
+    vertices[np.repeat(np.arange(n_faces), counts), slot] = near.indices
+    there = vertices >= 0
+    components = np.arange(per_vertex)
+    columns = np.where(there[..., None], vertices[..., None] * per_vertex + components, n)
+    seeds_of = np.where(there[..., None], colour[vertices][..., None] * per_vertex + components, 0)
+    last = np.arange(n_h)
+    columns, seeds_of = (
+        np.concatenate([table.reshape(len(vertices), -1), np.tile(tail, (len(vertices), 1))], axis=1)
+        for table, tail in ((columns, n_vertices * per_vertex + last), (seeds_of, n_colours * per_vertex + last))
+    )
+    seeds = np.zeros((n_colours * per_vertex + n_h + 1, n))
+    rows = np.arange(n_vertices * per_vertex)
+    seeds[colour[rows // per_vertex] * per_vertex + rows % per_vertex, rows] = 1
+    seeds[n_colours * per_vertex + last, n_vertices * per_vertex + last] = 1
+    seeds[-1] = np.random.default_rng(0).normal(size=n)
+    pattern, places = _pattern(columns, n)
+    directions = jax.vmap(lambda row: to_unknowns(row, zero))(jnp.asarray(seeds))
+    return Elements(columns, seeds_of, directions, pattern, places, n)
+
+
+def to_unknowns(row: Float[Array, "n"], like: Unknowns) -> Unknowns:
+    """A vector of all unknowns, vertex by vertex and then h, as offsets."""
+    parts = [part for part in (like.vertices, like.normals) if part is not None]
+    n_vertices = parts[0].shape[0] if parts else 0
+    width = sum(part.shape[1] for part in parts)
+    table = row[: n_vertices * width].reshape(n_vertices, width)
+    n_first = 0 if like.vertices is None else 3
+    h = None if like.h is None else row[n_vertices * width :].reshape(like.h.shape).astype(like.h.dtype)
+    dtype = parts[0].dtype if parts else None
+    return Unknowns(
+        None if like.vertices is None else table[:, :n_first].astype(dtype),
+        None if like.normals is None else table[:, n_first:].astype(dtype),
+        h,
+    )
+
+
+@eqx.filter_jit
+def differentiate(
+    zero: Unknowns, start: Start, pairs: Pairs, seeds: Unknowns, seeds_of: Int[Array | np.ndarray, "m d"]
+) -> tuple[Rows, Float[Array, "m d"], Float[Array, "m"]]:
+    """Rows at the start, their derivatives by the unknowns of their faces, and those along the last seed."""
+    rows, derivative = jax.linearize(lambda offset: residuals(offset, start, pairs), zero)
+    along = jax.lax.map(lambda seed: jnp.concatenate(derivative(seed)), seeds)
+    return rows, jnp.take_along_axis(along.T, seeds_of, axis=1), along[-1]
+
+
+def forgets_some(
+    elements: Elements, by: Float[np.ndarray, "m d"], face: Int[np.ndarray, "m"], along: np.ndarray
+) -> bool:
+    """Whether rows depend on unknowns that the elements do not know of: seen in the derivative along the last seed."""
+    seed = np.append(flat(jax.tree.map(lambda rows: rows[-1], elements.seeds)), 0.0)
+    by_elements = np.einsum("md,md->m", by, seed[elements.columns[face]])
+    return bool(np.abs(by_elements - along).max() > _WRONG * np.abs(along).max())
+
+
+def flat(unknowns: Unknowns) -> Shaped[np.ndarray, "n"]:
+    """All unknowns as one vector, vertex by vertex and then h."""
+    parts = [np.asarray(part) for part in (unknowns.vertices, unknowns.normals) if part is not None]
+    h = np.zeros(0) if unknowns.h is None else np.ravel(np.asarray(unknowns.h))
+    return np.concatenate([np.concatenate(parts, axis=1).ravel() if parts else np.zeros(0), h])
+
+
+def normal_matrix(
+    elements: Elements, by: Float[np.ndarray, "m d"], weights: Float[np.ndarray, "m"], face: Int[np.ndarray, "m"]
+) -> Float[np.ndarray, "_"]:
+    """Values of J' W J in the pattern of the elements."""
+    order = np.argsort(face, kind="stable")
+    counts = np.bincount(face, minlength=len(elements.columns))
+    blocks = -(-counts // _ROWS_A_BLOCK)
+    first = np.cumsum(counts) - counts
+    owner = np.repeat(np.arange(len(counts)), blocks)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(blocks) - blocks, blocks)
+    place = (first[owner] + number * _ROWS_A_BLOCK)[:, None] + np.arange(_ROWS_A_BLOCK)
+    inside = place < (first + counts)[owner][:, None]
+    rows = order[np.where(inside, place, 0)]
+    scaled = by[rows] * (np.sqrt(weights)[rows] * inside)[..., None]
+    products = np.matmul(scaled.transpose(0, 2, 1), scaled)
+    sums = np.bincount(elements.places[owner].ravel(), products.ravel(), minlength=elements.pattern.nnz + 1)
+    return sums[:-1]
+
+
+def times_transposed(
+    elements: Elements, by: Float[np.ndarray, "m d"], values: Float[np.ndarray, "m"], face: Int[np.ndarray, "m"]
+) -> Float[np.ndarray, "n"]:
+    """J' times a value a row."""
+    products = by * values[:, None]
+    return np.bincount(elements.columns[face].ravel(), products.ravel(), minlength=elements.n + 1)[:-1]
+
+
+def jacobian(elements: Elements, by: Float[np.ndarray, "m d"], face: Int[np.ndarray, "m"]) -> sp.csr_array:
+    """J as a sparse matrix."""
+    m, d = by.shape
+    table = sp.csr_array(
+        (by.ravel(), elements.columns[face].ravel(), np.arange(0, m * d + 1, d)), shape=(m, elements.n + 1)
+    )
+    return table[:, :-1]
+
+
+def _vertices_near_faces(topology: js.Topology, rings: int) -> sp.csr_array:
+    """Faces by the vertices of the faces around them, `rings` rings of them."""
+    parts = [np.asarray(topology.control_faces[size]) for size in (3, 4)]
+    counts = np.concatenate([np.full(len(part), part.shape[1]) for part in parts])
+    corners = np.concatenate([part.ravel() for part in parts])
+    shape = (len(counts), topology.n_control_vertices)
+    at = sp.csr_array((np.ones(len(corners), np.int32), corners, np.append(0, np.cumsum(counts))), shape=shape)
+    near = at
+    for _ in range(rings):
+        near = ((near @ at.T) @ at).tocsr()
+    near.sort_indices()
+    return near
+
+
+def _colour(near: sp.csr_array) -> Int[np.ndarray, "v"]:
+    """A colour for every vertex, so that no two in one face have the same: greedily, the crowded ones first."""
+    together = (near.T @ near).tocsr()
+    colour = np.full(len(together.indptr) - 1, -1)
+    for vertex in np.argsort(-np.diff(together.indptr), kind="stable"):
+        taken = colour[together.indices[together.indptr[vertex] : together.indptr[vertex + 1]]]
+        free = np.ones(len(taken) + 1, bool)
+        free[taken[(taken >= 0) & (taken < len(free))]] = False
+        colour[vertex] = np.argmax(free)
+    return colour
+
+
+def _pattern(columns: Int[np.ndarray, "f d"], n: int) -> tuple[sp.csc_array, Int[np.ndarray, "f d d"]]:
+    row, column = np.broadcast_arrays(columns[:, :, None], columns[:, None, :])
+    there = (row < n) & (column < n)
+    keys, inverse = np.unique(column[there].astype(np.int64) * n + row[there], return_inverse=True)
+    places = np.full(row.shape, len(keys), np.int64)
+    places[there] = inverse
+    indptr = np.searchsorted(keys // n, np.arange(n + 1))
+    return sp.csc_array((np.arange(len(keys), dtype=float), keys % n, indptr), shape=(n, n)), places
+
+
+def padded(
+    pairs: Pairs, weights: Float[np.ndarray, "p"], face: Int[np.ndarray, "p"]
+) -> Iterator[tuple[Pairs, Float[np.ndarray, "s"], Int[np.ndarray, "s"]]]:
+    """Runs of pairs, the last filled up with pairs of weight 0, so that few programs are compiled for all scans."""
+    n, size = len(weights), _run_length(len(weights))
+    for first in range(0, n, size):
+        rows = np.minimum(np.arange(first, first + size), n - 1)
+        counted = np.where(np.arange(first, first + size) < n, weights[rows], 0.0)
+        yield Pairs(*(jnp.asarray(np.asarray(part)[rows]) for part in pairs)), counted, face[rows]
+
+
+def _run_length(n: int) -> int:
+    if n >= _PAIRS_AT_ONCE:
+        return _PAIRS_AT_ONCE
+    step = 1 << max(n.bit_length() - 3, 0)
+    return -(-n // step) * step

@@ -1,0 +1,67 @@
+"""How smooth the surface is, found from the scan: the bend prior that makes the scan most probable, place by place.
+
+The strength of a Gaussian prior under which data are most probable obeys a fixed point: the bends that are left, over
+their variance, equal the number of bends that the data do not determine. Source: D. MacKay, Bayesian interpolation,
+1992, eq. (4.7); as an update for any number of strengths at once, S. Wood and M. Fasiolo, A generalized Fellner-Schall
+method for smoothing parameter optimization, 2017, eq. (4). Here every control face has a strength of its own, shared
+with its neighbourhood and, a little, with the whole surface: a skull is smoother than an ear.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float, Int
+
+import jaxsubdiv as js
+
+Solve = Callable[[Float[np.ndarray, "n k"]], Float[np.ndarray, "n k"]]
+
+_PROBES = 24  # random vectors of a trace; a face's neighbourhood averages over hundreds of rows besides
+_SHARE_OF_ALL = 0.3  # how much the whole surface counts beside a face's neighbourhood
+_LARGEST_CHANGE = 5.0  # of a strength in one sweep: what it depends on is known for the present one only
+
+
+def neighbourhoods(topology: js.Topology) -> sp.csr_array:
+    """Averages of a value a face over the faces around each of its corners, the corners counting alike."""
+    parts = [np.asarray(topology.control_faces[size]) for size in (3, 4)]
+    corners = np.concatenate([part.ravel() for part in parts])
+    counts = np.concatenate([np.full(len(part), part.shape[1]) for part in parts])
+    face = np.repeat(np.arange(len(counts)), counts)
+    at = sp.csr_array((np.ones(len(face)), (face, corners)), shape=(len(counts), topology.n_control_vertices))
+    around = np.maximum(np.asarray(at.sum(axis=0)).ravel(), 1)
+    return (sp.diags_array(1 / counts) @ at @ sp.diags_array(1 / around) @ at.T).tocsr()
+
+
+def next_precision(
+    precision: Float[np.ndarray, "f"],
+    bends: Float[np.ndarray, "b"],
+    by: sp.csr_array,
+    face: Int[np.ndarray, "b"],
+    solve_prior: Solve,
+    solve_posterior: Solve,
+    around: sp.csr_array,
+) -> Float[np.ndarray, "f"]:
+    """One step of the fixed point.
+
+    Args:
+        precision: 1 / variance of a bend, a control face, in 1/mm^2.
+        bends: in mm.
+        by: their derivatives by the unknowns.
+        face: the control face of each bend.
+        solve_prior: with the normal matrix of all priors.
+        solve_posterior: with that of the priors and the scan.
+        around: see `neighbourhoods`.
+    """
+    root = np.sqrt(precision)[face]
+    probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(bends), _PROBES))
+    sides = by.T @ (probes * root[:, None])
+    free = root * np.mean(probes * (by @ (solve_prior(sides) - solve_posterior(sides))), axis=1)
+    n = len(precision)
+    determined = around @ np.bincount(face, free, n)
+    left = around @ np.bincount(face, (root * bends) ** 2, n)
+    ratio = np.maximum(_SHARE_OF_ALL * determined.mean() + determined, 0) / np.maximum(
+        _SHARE_OF_ALL * left.mean() + left, np.finfo(float).tiny
+    )
+    changed = precision * np.clip(ratio, 1 / _LARGEST_CHANGE, _LARGEST_CHANGE)
+    return np.exp(around @ np.log(changed))
