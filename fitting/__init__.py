@@ -6,6 +6,8 @@ from ._fit import Sweep as Sweep
 from ._fit import fit as fit
 from ._free import Free as Free
 from ._picture import draw_fit as draw_fit
+from ._posterior import Uncertainty as Uncertainty
+from ._refit import Refit as Refit
 from ._report import Report as Report
 from ._residuals import Priors as Priors
 from ._result import FitResult as FitResult

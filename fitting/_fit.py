@@ -16,7 +16,7 @@ from jaxsubdiv._linalg import dot, unit
 from ._correspondence import boundary_vertices
 from ._free import Free, apply_offset, edge_length
 from ._look import Look, look
-from ._posterior import Problem
+from ._problem import Problem
 from ._residuals import Priors
 from ._result import FitResult
 from ._robust import AbstractLoss, geman_mcclure
@@ -27,7 +27,7 @@ _FAR = 0.05
 # Scans in metres against a mesh in mm differ by 1000; a partial scan of the anatomy by much less than this.
 _UNIT_RATIO = 20.0
 # The least noise, in control edges: a perfect scan would have none, and its points infinite weight.
-_LEAST_NOISE = 1e-6
+_LEAST_NOISE = 1e-4
 # Movements far below a control edge are at rest, however exact the scan.
 _AT_REST = 0.01
 _MOST = 0.9  # of the surface: so much of it has to be at rest
@@ -128,6 +128,8 @@ def fit(
         robust_rms=np.array(robust_rms),
         noise=float(seen.noise),
         result=result,
+        problem=problem,
+        seen=seen,
     )
     if throw and result != optx.RESULTS.successful:
         raise RuntimeError(

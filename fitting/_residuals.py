@@ -91,15 +91,15 @@ class Start(NamedTuple):
 class Rows(NamedTuple):
     """Residuals before they are weighed; in mm where nothing else is said."""
 
-    distance: Float[Array, "p"]
-    bend: Float[Array, "b"]
-    stretch: Float[Array, "s"]
+    distance: Float[Array | np.ndarray, "p"]
+    bend: Float[Array | np.ndarray, "b"]
+    stretch: Float[Array | np.ndarray, "s"]
     """Three a control edge, as parts of its length."""
-    margin: Float[Array, "c"]
+    margin: Float[Array | np.ndarray, "c"]
     """One a corner of the control faces, over its own standard deviation."""
-    landmark: Float[Array, "l"]
+    landmark: Float[Array | np.ndarray, "l"]
     """Three a landmark, over its standard deviation."""
-    h: Float[Array, "n"]
+    h: Float[Array | np.ndarray, "n"]
     """h - 1."""
 
 

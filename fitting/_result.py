@@ -1,5 +1,6 @@
 """What a fit returns."""
 
+import functools
 from typing import final
 
 import numpy as np
@@ -8,6 +9,10 @@ from jaxtyping import Bool, Float
 
 import jaxsubdiv as js
 
+from ._look import Look
+from ._posterior import Posterior, Uncertainty
+from ._problem import Problem
+from ._refit import Refit, make_refit
 from ._report import Report
 from ._scan import Scan
 
@@ -46,6 +51,8 @@ class FitResult:
         robust_rms: Float[np.ndarray, "sweeps"],
         noise: float,
         result: optx.RESULTS,
+        problem: Problem,
+        seen: Look,
     ):
         self.control = control
         self.scheme = scheme
@@ -58,6 +65,24 @@ class FitResult:
         self.robust_rms = robust_rms
         self.noise = noise
         self.result = result
+        self._problem, self._seen = problem, seen
+
+    @functools.cached_property
+    def posterior(self) -> Posterior:
+        """The surfaces that scan and priors leave probable; made when it is first asked for."""
+        return Posterior(self._problem, self.scheme, self.control, self._seen)
+
+    def uncertainty(self) -> Uncertainty:
+        """Standard deviations of the control vertices and of the surface's vertices, across the surface, in mm.
+
+        They say how far the surface may be off the anatomy because of noise, holes and few points; not how far it is
+        where the control mesh is too coarse for it. Exact for up to 4,000 unknowns, else from random draws.
+        """
+        return self.posterior.uncertainty()
+
+    def refit(self) -> Refit:
+        """The fitted control as a differentiable function of scan points and weights; see `Refit`."""
+        return make_refit(self.posterior)
 
     @property
     def inliers(self) -> Bool[np.ndarray, "p"]:

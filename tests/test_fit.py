@@ -321,7 +321,7 @@ def test_perfect_start_stays_finite():
     p = problem()
     scan = np.resize(np.asarray(js.refine(js.Interpolating(), p.topology, p.truth).vertices), (N_POINTS, 3))
     found = p.fit(scan, control=p.truth, tolerance=1e-3)
-    assert found.result == CONVERGED and found.rms[-1] < 1e-4
+    assert found.result == CONVERGED and found.rms[-1] < 1e-3
 
 
 # Fits that fail

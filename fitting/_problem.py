@@ -1,0 +1,253 @@
+"""One sweep's equations: what scan and priors say of the unknowns, and the step that makes both most probable."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float, Int
+from scipy.sparse.linalg import SuperLU, splu
+
+import jaxsubdiv as js
+
+from ._elements import (
+    Elements,
+    differentiate,
+    find_elements,
+    flat,
+    forgets_some,
+    jacobian,
+    normal_matrix,
+    padded,
+    times_transposed,
+    to_unknowns,
+)
+from ._evidence import neighbourhoods, next_precision
+from ._free import Free, Unknowns, edge_length, no_offset
+from ._look import Look
+from ._residuals import Anchors, Pairs, Priors, Rows, Start, control_face, prior_faces
+
+# Standard deviation of a step in control edges: what neither scan nor priors hold stays near where it is. A control
+# vertex that turns back is held faster, and one that goes on is let go again: where the surface cannot follow the scan
+# (an ear in a coarse mesh) points change sides from sweep to sweep, and exact steps would go to and fro for ever.
+_STEP, _HOLD, _LET_GO, _FASTEST = 0.25, 8.0, 0.7, 1e6
+_SOFTER = 0.3  # factor of the bend prior from sweep to sweep, down to its own strength
+_SETTLED = 0.3  # mean change of the logarithm of the bend prior's strength in a sweep
+_LEAST_LEFT = 0.1  # of the degrees of freedom: what is less says that the scan has too few points
+_PROBES = 16  # random vectors of a trace
+_MOST_RINGS = 3
+_TINY = np.finfo(float).tiny
+_BENDS = 1.0, 1e-5  # most and least bend asymmetry that is looked for, in control edges
+
+
+class _Equations(NamedTuple):
+    """Normal equations of a sweep."""
+
+    data: Float[np.ndarray, "_"]
+    """Values of the scan's matrix, in the pattern of the elements."""
+    prior: Float[np.ndarray, "_"]
+    """Of the priors' matrix."""
+    gradient: Float[np.ndarray, "n"]
+    bends: Float[np.ndarray, "b"]
+    by_bend: Float[np.ndarray, "b d"]
+
+
+class Problem:
+    """What stays the same from sweep to sweep; and the strength of the bend prior, which the sweeps find."""
+
+    def __init__(
+        self,
+        scheme: js.AbstractScheme,
+        topology: js.Topology,
+        control: js.Control,
+        free: Free,
+        priors: Priors,
+        anchors: Anchors | None = None,
+    ):
+        self._topology, self.free, self._priors, self._anchors = topology, free, priors, anchors
+        self._template = np.asarray(control.vertices, np.float64)
+        self._zero = no_offset(free, scheme, control)
+        masks = free.of(scheme, len(self._template))
+        self.is_free = flat(masks).astype(bool)
+        self._faces = prior_faces(topology, anchors, 0 if masks.h is None else masks.h.size)
+        self._around = neighbourhoods(topology)
+        self._edge = float(edge_length(topology, control.vertices))
+        self._elements: Elements | None = None
+        self._precision: Float[np.ndarray, "f"] = np.zeros(0)  # of the bends, a control face; found in the first sweep
+        self._hold = np.full(self.is_free.shape, (_STEP * self._edge) ** -2)
+        self.loose = self._hold.copy()
+        self._last_step = np.zeros(self.is_free.shape)
+        self.annealed = False
+        self.determined = 0.0
+
+    def step(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> Unknowns:
+        """The most probable offset from here, to first order. It also finds the next strength of the bend prior."""
+        found = self._equations(scheme, control, seen)
+        factor = factorise(self._matrix(found.data + found.prior, self._hold))
+        step = np.zeros(self.elements.n)
+        step[self.is_free] = -factor.solve(found.gradient[self.is_free])
+        self._hold_what_turns_back(step)
+        self._count_determined(found.data, factor)
+        if self._priors.bend is None:
+            self._find_bend(found, step, factor)
+        else:
+            self._set_bend(self._precision * _SOFTER)
+        return to_unknowns(jnp.asarray(step), self._zero)
+
+    def precision_matrix(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> sp.csc_array:
+        """Of the free unknowns, about here: the inverse of their covariance."""
+        found = self._equations(scheme, control, seen)
+        return self._matrix(found.data + found.prior, self.loose)
+
+    def _equations(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> _Equations:
+        start = self.start(scheme, control)
+        face = control_face(self._topology, np.asarray(seen.at.face))
+        if self._elements is None:
+            self._elements = self._analyse(start, seen, face)
+        elements, faces = self._elements, self._faces
+        data, gradient = np.zeros(elements.pattern.nnz), np.zeros(elements.n)
+        rows, by_priors = None, np.zeros((0, 0))
+        for part, counts, at in padded(seen.pairs, self.distance_precisions(seen), face):
+            rows, by = self._differentiate(start, part, at)
+            by_distance, by_priors = np.split(by, [len(at)])
+            data += normal_matrix(elements, by_distance, counts, at)
+            gradient += times_transposed(elements, by_distance, counts * np.asarray(rows.distance), at)
+        assert rows is not None  # a scan has points
+        if not len(self._precision):
+            # As smooth as the template, to begin with.
+            self._set_bend(np.full(len(elements.columns), 1 / max(float(np.mean(np.square(rows.bend))), _TINY)))
+        weights, of_priors = np.concatenate(self.prior_precisions()), np.concatenate(faces)
+        gradient += times_transposed(elements, by_priors, weights * np.concatenate(rows[1:]), of_priors)
+        prior = normal_matrix(elements, by_priors, weights, of_priors)
+        return _Equations(data, prior, gradient, np.asarray(rows.bend), by_priors[: len(rows.bend)])
+
+    def prior_precisions(self) -> Rows:
+        """1 / variance of every row of the priors; there are none of distances."""
+        faces = self._faces
+        stretch, h = float(self._priors.stretch) ** -2, float(self._priors.h) ** -2
+        return Rows(
+            distance=np.zeros(0),
+            bend=self._precision[faces.bend],
+            stretch=np.full(len(faces.stretch), stretch),
+            margin=np.ones(len(faces.margin)),
+            landmark=np.ones(len(faces.landmark)),
+            h=np.full(len(faces.h), h),
+        )
+
+    def distance_precisions(self, seen: Look) -> Float[np.ndarray, "p"]:
+        """1 / variance of every distance. A fit of many unknowns to few points leaves less than the noise in them."""
+        left = max(1 - self.determined / max(float(np.sum(seen.weights)), 1.0), _LEAST_LEFT)
+        return left * np.asarray(seen.precisions, np.float64)
+
+    def start(self, scheme: js.AbstractScheme, control: js.Control) -> Start:
+        """The arguments of the residuals, for a sweep that starts here."""
+        template = _moved_to(self._template, np.asarray(control.vertices, np.float64))
+        return Start(scheme, self._topology, control, jnp.asarray(template, control.vertices.dtype), self._anchors)
+
+    def across(
+        self, scheme: js.AbstractScheme, control: js.Control
+    ) -> tuple[Int[np.ndarray, "w"], Float[np.ndarray, "w d"]]:
+        """How the vertices of the surface move along their normals: the control face of each, and the derivatives."""
+        surface = js.refine(scheme, self._topology, control)
+        n = surface.vertices.shape[0]
+        face = np.zeros(n, np.int64)
+        before = 0
+        for size in (3, 4):
+            corners = np.asarray(surface.faces[size])
+            face[corners] = control_face(self._topology, before + np.arange(len(corners)))[:, None]
+            before += len(corners)
+        itself = jnp.tile(jnp.eye(1, 4, dtype=surface.vertices.dtype), (n, 1))
+        pairs = Pairs(surface.vertices, jnp.repeat(jnp.arange(n)[:, None], 4, axis=1), itself, surface.normals)
+        start = self.start(scheme, control)
+        parts = [self._differentiate(start, part, at)[1][: len(at)] for part, _, at in padded(pairs, np.ones(n), face)]
+        return face, np.concatenate(parts)[:n]
+
+    def _find_bend(self, found: _Equations, step: Float[np.ndarray, "n"], factor: SuperLU) -> None:
+        by = jacobian(self.elements, found.by_bend, self._faces.bend)[:, self.is_free]
+        next_one = next_precision(
+            self._precision,
+            found.bends + by @ step[self.is_free],
+            by,
+            self._faces.bend,
+            factorise(self._matrix(found.prior, self.loose)).solve,
+            factor.solve,
+            self._around,
+        )
+        before = self._precision
+        self._set_bend(next_one)
+        self.annealed = bool(np.abs(np.log(self._precision / before)).mean() < _SETTLED)
+
+    def _count_determined(self, data: Float[np.ndarray, "_"], factor: SuperLU) -> None:
+        """The trace of the scan's part of the posterior, by random vectors."""
+        probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(int(self.is_free.sum()), _PROBES))
+        of_data = self._matrix(data, np.zeros(len(self.is_free)))
+        self.determined = max(float(np.mean(np.sum(probes * factor.solve(of_data @ probes), axis=0))), 0.0)
+
+    def _hold_what_turns_back(self, step: Float[np.ndarray, "n"]) -> None:
+        width = (len(step) - len(self._faces.h)) // max(len(self._template), 1)
+        n = width * len(self._template)
+        agree = np.sum((step * self._last_step)[:n].reshape(-1, width), axis=1) if width else np.zeros(0)
+        factor = np.ones(len(step))
+        factor[:n] = np.repeat(np.where(agree < 0, _HOLD, _LET_GO), width)
+        self._hold = np.clip(self._hold * factor, self.loose, _FASTEST * self.loose)
+        self._last_step = step
+
+    def _set_bend(self, precision: Float[np.ndarray, "f"]) -> None:
+        """The strength found; or the one that the priors ask for, or a stiffer one while it anneals."""
+        self._precision = np.clip(precision, *((self._edge * part) ** -2.0 for part in _BENDS))
+        if self._priors.bend is not None:
+            given = float(self._priors.bend) ** -2
+            self._precision = np.maximum(self._precision, given)
+            self.annealed = bool((self._precision <= given).all())
+
+    def _analyse(self, start: Start, seen: Look, face: Int[np.ndarray, "p"]) -> Elements:
+        """Which unknowns belong to which face: as few rings of faces as explain all derivatives."""
+        pairs, _, face = next(padded(seen.pairs, np.asarray(seen.precisions), face))
+        for rings in range(1, _MOST_RINGS + 1):
+            found = find_elements(self._topology, self.free, start, rings)
+            row_faces = np.concatenate(self._faces._replace(distance=face))
+            _, by, along = differentiate(self._zero, start, pairs, found.seeds, found.seeds_of[row_faces])
+            if not forgets_some(found, np.asarray(by), row_faces, np.asarray(along)):
+                return found
+        raise ValueError(
+            f"a face of {type(start.scheme).__name__} depends on control vertices more than {_MOST_RINGS} rings of "
+            "faces away: the fit has no sparse derivatives to work with."
+        )
+
+    def _differentiate(
+        self, start: Start, pairs: Pairs, face: Int[np.ndarray, "p"]
+    ) -> tuple[Rows, Float[np.ndarray, "m d"]]:
+        seeds_of = self.elements.seeds_of[np.concatenate(self._faces._replace(distance=face))]
+        rows, by, _ = differentiate(self._zero, start, pairs, self.elements.seeds, seeds_of)
+        return jax.tree.map(lambda values: np.asarray(values, np.float64), (rows, by))
+
+    @property
+    def elements(self) -> Elements:
+        """The structure, known after the first sweep."""
+        assert self._elements is not None
+        return self._elements
+
+    def _matrix(self, values: np.ndarray, diagonal: np.ndarray) -> sp.csc_array:
+        pattern = self.elements.pattern
+        whole = sp.csc_array((values, pattern.indices, pattern.indptr), shape=pattern.shape)
+        whole = (whole + sp.diags_array(diagonal)).tocsc()
+        return whole if self.is_free.all() else whole[self.is_free][:, self.is_free].tocsc()
+
+    def _trace(self, values: np.ndarray) -> float:
+        return float(self._matrix(values, np.zeros(self.elements.n)).diagonal().sum())
+
+
+def factorise(matrix: sp.csc_array) -> SuperLU:
+    # Symmetric and positive definite: no pivoting, and an ordering for symmetric patterns.
+    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+def _moved_to(template: Float[np.ndarray, "v 3"], vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
+    """The template, turned, scaled and shifted to where the vertices are. Source: Umeyama 1991."""
+    middle, there = template.mean(axis=0), vertices.mean(axis=0)
+    a, b = template - middle, vertices - there
+    u, s, vt = np.linalg.svd(b.T @ a)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    scale = (s * signs).sum() / max((a**2).sum(), np.finfo(float).tiny)
+    return scale * a @ (u * signs @ vt).T + there
