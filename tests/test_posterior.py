@@ -1,0 +1,291 @@
+"""The equations of a sweep, the smoothness found from the scan, the uncertainty, and the fit as a function of the scan."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import meshes
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from scans import N_POINTS, SIGMA, noise, problem
+from schemes import MIXED, control_mesh, random_control
+
+import fitting
+import jaxsubdiv as js
+from fitting import Free, Priors, Scan, _elements, _posterior, _refit
+from fitting._elements import differentiate, find_elements, flat, forgets_some, jacobian, normal_matrix, to_unknowns
+from fitting._evidence import neighbourhoods, next_precision
+from fitting._free import no_offset
+from fitting._residuals import Pairs, Start, control_face, prior_faces, residuals
+
+# Derivatives by elements
+
+
+@functools.cache
+def mixed_rows(kind: str, levels: int):
+    """Everything that the elements of a mesh of triangles and quads are made from, and its derivatives in full."""
+    scheme = {
+        "default": js.Interpolating(1.1),
+        "h a level": js.Interpolating([1.1] * levels),
+        "circle": js.CirclePreserving(),
+    }
+    scheme = scheme[kind]
+    mesh, free = control_mesh(MIXED), Free()
+    topology, control = js.build_topology(mesh, scheme, levels), random_control(MIXED, 0)
+    surface = js.refine(scheme, topology, control)
+    face = np.random.default_rng(1).integers(surface.n_faces, size=60)
+    at = js.SurfacePoint(face, np.full((60, 2), 0.3))
+    corners, weights = js._surface.corner_weights(surface, at)
+    directions = js.evaluate(surface, at).normals
+    pairs = Pairs(js.evaluate(surface, at).points + 0.1 * directions, corners, weights, directions)
+    start = Start(scheme, topology, control, jnp.asarray(mesh.vertices), None)
+    zero = no_offset(free, scheme, control)
+    faces = prior_faces(topology, None, zero.h.size)._replace(distance=control_face(topology, face))
+
+    @jax.jit
+    def in_full(start, pairs):
+        def of_vector(vector):
+            return jnp.concatenate(residuals(to_unknowns(vector, zero), start, pairs))
+
+        return jax.jacfwd(of_vector)(jnp.zeros(flat(zero).size))
+
+    return start, pairs, zero, np.concatenate(faces), np.asarray(in_full(start, pairs))
+
+
+@pytest.mark.parametrize(("kind", "levels"), [("default", 2), ("h a level", 2), ("circle", 1)])
+def test_derivatives_by_elements_are_those_in_full(kind, levels):
+    start, pairs, zero, face, in_full = mixed_rows(kind, levels)
+    elements = find_elements(start.topology, Free(), start, rings=1)
+    _, by, along = differentiate(zero, start, pairs, elements.seeds, elements.seeds_of[face])
+    assert not forgets_some(elements, np.asarray(by), face, np.asarray(along))
+    np.testing.assert_allclose(jacobian(elements, np.asarray(by), face).toarray(), in_full, atol=1e-12)
+    # Far fewer derivatives than unknowns: that is what the colours are for.
+    assert elements.seeds.vertices.shape[0] < 0.75 * flat(zero).size
+
+    weights = np.random.default_rng(2).uniform(0.5, 2, len(face))
+    values = normal_matrix(elements, np.asarray(by), weights, face)
+    pattern = elements.pattern
+    found = sp.csc_array((values, pattern.indices, pattern.indptr), shape=pattern.shape).toarray()
+    np.testing.assert_allclose(found, in_full.T @ (weights[:, None] * in_full), atol=1e-10)
+    np.testing.assert_allclose(
+        _elements.times_transposed(elements, np.asarray(by), weights, face), in_full.T @ weights, atol=1e-10
+    )
+
+
+def test_elements_that_are_too_small_are_noticed():
+    start, pairs, zero, face, _ = mixed_rows("default", 2)
+    elements = find_elements(start.topology, Free(), start, rings=0)
+    _, by, along = differentiate(zero, start, pairs, elements.seeds, elements.seeds_of[face])
+    assert forgets_some(elements, np.asarray(by), face, np.asarray(along))
+
+
+def test_vectors_of_unknowns_go_to_offsets_and_back():
+    start, _, zero, _, _ = mixed_rows("h a level", 2)
+    vector = np.arange(flat(zero).size, dtype=float)
+    np.testing.assert_array_equal(flat(to_unknowns(jnp.asarray(vector), zero)), vector)
+    for free in (Free(normals=False), Free(vertices=False), Free(True, True, False), Free(False, False, True)):
+        like = no_offset(free, start.scheme, start.control)
+        vector = np.arange(flat(like).size, dtype=float)
+        np.testing.assert_array_equal(flat(to_unknowns(jnp.asarray(vector), like)), vector)
+
+
+@pytest.mark.parametrize("n", [1, 7, 100, 5_000])
+def test_pairs_come_in_runs_that_few_programs_serve(n, monkeypatch):
+    monkeypatch.setattr(_elements, "_PAIRS_AT_ONCE", 512)
+    rows = np.arange(n)
+    pairs = Pairs(*(jnp.asarray(np.tile(rows[:, None], (1, width))) for width in (3, 4, 4, 3)))
+    runs = list(_elements.padded(pairs, np.ones(n), rows))
+    sizes = {len(face) for _, _, face in runs}
+    assert len(sizes) == 1 and sizes.pop() <= max(512, 1.34 * n)
+    counted = np.concatenate([face[weights > 0] for _, weights, face in runs])
+    np.testing.assert_array_equal(counted, rows)
+    np.testing.assert_array_equal(runs[-1][0].points[:, 0], runs[-1][2])
+
+
+# Smoothness from the scan
+
+
+def test_strength_of_the_prior_is_that_which_the_unknowns_were_drawn_with():
+    """A line of faces, their bends measured with noise: rough at one end and smooth at the other."""
+    rng, n = np.random.default_rng(0), 400
+    face = np.repeat(np.arange(n // 8), 8)
+    truth = np.where(np.arange(n) < n // 2, 1.0, 0.1)
+    measured = rng.normal(scale=truth) + rng.normal(scale=0.3, size=n)
+    around = sp.csr_array(np.abs(np.subtract.outer(range(n // 8), range(n // 8))) <= 3, dtype=float)
+    around = sp.diags_array(1 / around.sum(axis=1)) @ around
+    precision = np.full(n // 8, 4.0)
+    for _ in range(30):
+        prior, data = precision[face], 1 / 0.3**2
+        precision = next_precision(
+            precision,
+            measured * data / (data + prior),
+            sp.eye_array(n, format="csr"),
+            face,
+            lambda sides, prior=prior: sides / (prior + 1e-9)[:, None],
+            lambda sides, prior=prior, data=data: sides / (prior + data)[:, None],
+            around,
+        )
+    deviation = precision**-0.5
+    assert 0.7 < np.median(deviation[:20]) < 1.3 and 0.05 < np.median(deviation[-20:]) < 0.2
+
+
+def test_neighbourhoods_average():
+    mesh = control_mesh(meshes.grid(4, 3, "mixed"))
+    around = neighbourhoods(js.build_topology(mesh, js.Interpolating(), 1))
+    np.testing.assert_allclose(around @ np.ones(mesh.n_faces), 1)
+    assert 0.1 < np.abs(around @ np.eye(mesh.n_faces)[0]).max() < 0.9
+
+
+@functools.cache
+def fitted(**options) -> fitting.FitResult:
+    return problem().fit(problem().points + noise(), tolerance=0.05, **options)
+
+
+def to_truth(result: fitting.FitResult) -> float:
+    points = problem().points
+    at = fitting.closest_points(result.surface, points)
+    return float(np.sqrt(np.mean((js.evaluate(result.surface, at).points - points) ** 2) * 3))
+
+
+def roughness(result: fitting.FitResult) -> float:
+    bends = fitting._residuals.bend_asymmetry(problem().topology, result.surface)
+    return float(np.sqrt(np.mean(bends**2)))
+
+
+def test_bend_prior_that_is_given_smooths_as_it_says():
+    stiff, found, loose = (
+        problem().fit(problem().points + noise(), priors=Priors(bend=bend), tolerance=0.05)
+        for bend in (0.01, None, 20.0)
+    )
+    assert roughness(stiff) < roughness(found) < roughness(loose)
+    assert to_truth(found) < 1.05 * min(to_truth(stiff), to_truth(loose))
+
+
+def test_stretch_prior_holds_the_edges_in_length():
+    topology, start = problem().topology, np.asarray(problem().start.vertices)
+    edges = np.asarray(topology.levels[0].edges)
+
+    def change(result):
+        before, after = (np.linalg.norm(np.diff(x[edges], axis=1), axis=2) for x in (start, result.control.vertices))
+        return np.std(np.log(np.asarray(after) / before))
+
+    tight, loose = (fitted_with(Priors(stretch=value)) for value in (0.003, 1.0))
+    assert change(tight) < 0.5 * change(loose)
+
+
+def test_h_prior_holds_h():
+    tight, loose = (fitted_with(Priors(h=value)) for value in (0.003, 1.0))
+    assert abs(tight.scheme.h - 1) < 0.02 < 0.05 < abs(loose.scheme.h - 1)
+
+
+def fitted_with(priors: Priors) -> fitting.FitResult:
+    return problem().fit(problem().points + noise(), priors=priors)
+
+
+@pytest.mark.parametrize("name", ["bend", "stretch", "h"])
+def test_priors_are_standard_deviations(name):
+    with pytest.raises(ValueError, match=r"must be positive; got 0\.0\. Give jnp\.inf to leave a prior out"):
+        Priors(**{name: 0.0})
+
+
+def test_points_are_trusted_by_their_deviations():
+    p, exact = problem(), np.arange(N_POINTS) % 2 == 0
+    scan = p.points + np.where(exact, 0.2, 2.0)[:, None] * noise()
+    told, untold = (
+        fitting.fit(js.Interpolating(), p.topology, p.start, Scan(scan, deviations=given), throw=False)
+        for given in (np.where(exact, 0.1, 1.0), None)
+    )
+    assert to_truth(told) < 0.8 * to_truth(untold)
+
+
+def test_points_whose_normals_look_away_are_left_out():
+    p = problem()
+    surface = js.refine(js.Interpolating(p.h), p.topology, p.truth)
+    points, normals = js.sample(surface, N_POINTS, jax.random.key(3))
+    away = np.arange(N_POINTS) % 4 == 0
+    normals = np.where(away[:, None], -np.asarray(normals), normals)
+    found = fitting.fit(js.Interpolating(), p.topology, p.start, Scan(points, normals), throw=False, max_sweeps=3)
+    assert not np.any(found.weights[away]) and np.mean(found.weights[~away] > 0) > 0.95
+
+
+# Uncertainty
+
+
+def test_bands_hold_the_truth_as_often_as_they_say():
+    """Over ten scans of one surface, by the distance of its own points from the fits."""
+    p, inside = problem(), []
+    for seed in range(10):
+        found = p.fit(p.points + noise(seed))
+        surface = js.refine(js.Interpolating(p.h), p.topology, p.truth)
+        at = fitting.closest_points(surface, np.asarray(found.surface.vertices))
+        off = np.linalg.norm(js.evaluate(surface, at).points - found.surface.vertices, axis=1)
+        inside.append(np.mean(off < found.uncertainty().surface))
+    assert 0.55 < np.mean(inside) < 0.85
+
+
+def test_uncertainty_is_larger_in_a_hole():
+    p = problem()
+    top = p.points[:, 2] > 8
+    scan = np.where(top[:, None], np.resize(p.points[~top], p.points.shape), p.points) + noise()
+    whole, holed = (p.fit(points).uncertainty() for points in (p.points + noise(), scan))
+    z = np.asarray(p.truth.vertices)[:, 2]
+    assert np.all(holed.control[z > 12] > 1.5 * whole.control[z > 12])
+    np.testing.assert_array_equal(whole.control, whole.surface[: len(z)])
+
+
+def test_uncertainty_from_draws_is_the_exact_one(monkeypatch):
+    posterior = problem().fit(problem().points + noise(), max_sweeps=4).posterior
+    exact = posterior.uncertainty().surface
+    draws = posterior.draws(4000)
+    np.testing.assert_allclose(draws @ draws.T / 4000, np.linalg.inv(posterior.matrix.toarray()), atol=0.02)
+    monkeypatch.setattr(_posterior, "_DENSE", 0)
+    monkeypatch.setattr(_posterior, "_DRAWS", 2000)
+    np.testing.assert_allclose(posterior.uncertainty().surface, exact, rtol=0.08)
+
+
+def test_what_is_fixed_is_certain():
+    mask = np.arange(12) % 3 > 0
+    found = problem().fit(problem().points + noise(), free=Free(vertices=mask, h=False), max_sweeps=3)
+    deviation = found.uncertainty().control
+    assert np.all(deviation[~mask] == 0) and np.all(deviation[mask] > 0.01)
+
+
+# The fit as a function of the scan
+
+
+@pytest.mark.parametrize("whitened", ["whole", "by its diagonal"])
+def test_derivatives_of_the_fit_are_those_of_differences(whitened, monkeypatch):
+    if whitened != "whole":
+        monkeypatch.setattr(_refit, "_DENSE", 0)
+    p = problem()
+    points = jnp.asarray(p.points + noise())
+    refit = p.fit(points, max_sweeps=6).refit()
+    topology = p.topology
+
+    def volume(points, weights, refit):
+        scheme, control = refit(points, weights)
+        surface = js.refine(scheme, topology, control)
+        a, b, c = (surface.vertices[corner] for corner in surface.triangles().T)
+        return jnp.sum(a * jnp.cross(b, c)) / 6
+
+    compiled = jax.jit(jax.value_and_grad(volume, (0, 1)))
+    ones, rng = jnp.ones(N_POINTS), np.random.default_rng(0)
+    value, gradients = compiled(points, ones, refit)
+    assert value > 1e4
+    for which, scale in ((0, SIGMA), (1, 0.1)):
+        along = jnp.asarray(rng.normal(size=gradients[which].shape))
+        step = 1e-3 * scale
+        ahead, back = (
+            compiled(*((points + s * along, ones) if which == 0 else (points, ones + s * along)), refit)[0]
+            for s in (step, -step)
+        )
+        np.testing.assert_allclose(jnp.vdot(gradients[which], along), (ahead - back) / (2 * step), rtol=1e-3)
+
+
+def test_refit_refuses_another_number_of_points():
+    refit = problem().fit(max_sweeps=1).refit()
+    with pytest.raises(ValueError, match=r"the fit had points \[600, 3\]; got \[599, 3\]"):
+        refit(jnp.zeros((599, 3)))
+    with pytest.raises(ValueError, match=r"`weights` must have the shape \[600\]; got \[3\]"):
+        refit(jnp.zeros((600, 3)), jnp.ones(3))
