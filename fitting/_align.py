@@ -26,13 +26,15 @@ _REFINED = 3
 _MOVED = 1e-4  # of the size: a smaller step ends the search
 # Along the surface a pair pulls this much of what it pulls across: enough to hold what no point-to-plane row holds
 # (a sphere's rotation), too little to stop the slip that makes point-to-plane fast.
-_ALONG = 0.3
+_ALONG = 0.03
 _COUNTS = 4.0  # times the quantile `keep` of the distances: about 3 to 4 standard deviations
 _CUT = 4.685  # Tukey's, in robust standard deviations
 _MAD = 1.4826
-# Another start replaces the pose as given only where it is clearly better: a part of a scan fits many places well.
+# A pose far from the one given replaces it only where it is clearly better: a part of a scan fits many places well.
 _CLEARLY = 0.75
+_NEARBY = 30.0  # degrees
 _MIRRORED = 0.6
+_FITS = 0.004  # of the size: with so little left, no mirror is looked into
 _ALIKE = 1.1
 _FAR_ROTATION = 30.0  # degrees: two poses farther apart are two answers
 # Sizes that differ by more than this are no two people, but two units.
@@ -110,7 +112,6 @@ class _Found(NamedTuple):
     pose: _Pose
     score: float
     """Root mean square distance of the part `keep` of the points that lies nearest."""
-    given: bool
 
 
 def align(
@@ -124,10 +125,11 @@ def align(
 ) -> Alignment:
     """The control mesh moved to the scan, never mirrored.
 
-    Starts are the pose as given, the same moved onto the scan's middle with its axes in every other order, and the 24
-    proper ways to lay the principal axes of the template on the scan's; or the landmarks alone, where they fix a pose. From each a short trimmed
-    ICP runs on few points; the best ones are refined, point to plane with Tukey's weights. The pose as given stays
-    unless another is clearly better. Scattered outliers are dropped first. The same input gives the same answer.
+    Starts are the pose as given, the same moved onto the scan's middle, turned there by 30 degrees and with its axes in
+    every other order, and the 24 proper ways to lay the principal axes of the template on the scan's; or the landmarks
+    alone, where they fix a pose. From each a short trimmed ICP runs on few points; the best ones are refined, point to
+    plane with Tukey's weights. A pose near the given one is taken unless another is clearly better. Scattered outliers
+    are dropped first. The same input gives the same answer.
 
     Args:
         mesh: the template, open or closed. Its flat faces are what the scan is compared with.
@@ -173,20 +175,22 @@ def align(
     free = "similarity" if kind == "affine" else kind
     best = _best_starts(poses, few, surface, free, keep, placed)
     surface, many = _surface(mesh, _FINE[1]), _rows(points, _FINE[0])
-    fine = [_search(found.pose, many, surface, free, keep, placed, _FINE_STEPS, found.given) for found in best]
-    chosen = min(fine, key=lambda found: found.score * (_CLEARLY if found.given else 1))
+    fine = [_search(found.pose, many, surface, free, keep, placed, _FINE_STEPS) for found in best]
+    chosen = min(fine, key=lambda one: one.score * (_CLEARLY if _angle(one.pose.linear) < 2 * _NEARBY else 1))
     if start is None:
-        doubts += _other_answers(chosen, fine, of_mesh)
-        mirrored = _mirrored(mesh, few, of_mesh, moments, free, keep)
-        own = _search(chosen.pose, few, _surface(mesh, _COARSE[1]), free, keep, None, _COARSE_STEPS, True)
+        own = _search(chosen.pose, few, _surface(mesh, _COARSE[1]), free, keep, None, _COARSE_STEPS)
+        fits = own.score < _FITS * moments.size
+        mirrored = np.inf if fits else _mirrored(mesh, few, of_mesh, moments, free, keep)
         if mirrored < _MIRRORED * own.score:
             doubts.append(
                 f"the scan fits better as a mirror image ({mirrored:.2g} against {own.score:.2g} mm): perhaps an axis "
                 "was flipped or two axes were exchanged when it was written. Undo that; a fit never mirrors."
             )
+        else:
+            doubts += _other_answers(chosen, fine)
     pose = chosen.pose
     if kind == "affine":
-        pose = _search(pose, many, surface, kind, keep, placed, _FINE_STEPS, True).pose
+        pose = _search(pose, many, surface, kind, keep, placed, _FINE_STEPS).pose
     return _finish(mesh, scan, many, pose, surface, placed, keep, doubts)
 
 
@@ -232,7 +236,9 @@ def _moments(points: Float[np.ndarray, "n 3"], name: str) -> _Moments:
     _, width, axes = np.linalg.svd(x, full_matrices=False)
     if width[1] <= 1e-6 * width[0] or width[0] <= 1e-12 * np.abs(centre).max():
         where = "one spot" if width[0] <= 1e-12 * np.abs(centre).max() else "a line"
-        raise ScanError(f"all points of the {name} lie on {where}, near {np.round(centre, 3).tolist()}: no pose follows.")
+        raise ScanError(
+            f"all points of the {name} lie on {where}, near {np.round(centre, 3).tolist()}: no pose follows."
+        )
     axes = axes.T
     axes[:, 2] *= np.sign(np.linalg.det(axes))
     return _Moments(centre, axes, float(np.sqrt((x**2).sum(axis=1).mean())))
@@ -261,7 +267,8 @@ def _starts(template: _Moments, scan: _Moments, kind: Kind) -> list[_Pose]:
     sizes = [1.0] if kind == "rigid" else [1.0, scan.size / template.size]
     poses = [_Pose(np.eye(3), np.zeros(3))]
     turns = [(size, np.eye(3)) for size in sizes]
-    turns += [(sizes[0], turn) for turn in _quarter_turns()[1:]]
+    nearby = Rotation.from_rotvec(_NEARBY * np.concatenate([np.eye(3), -np.eye(3)]), degrees=True).as_matrix()
+    turns += [(sizes[0], turn) for turn in [*nearby, *_quarter_turns()[1:]]]
     turns += [(sizes[-1], scan.axes @ turn @ template.axes.T) for turn in _quarter_turns()]
     return poses + [_about(size * turn, template, scan) for size, turn in turns]
 
@@ -313,7 +320,6 @@ def _search(
     keep: float,
     placed: Placed | None,
     steps: int,
-    given: bool,
 ) -> _Found:
     """Iterated closest points from `pose`."""
     size = float(np.sqrt(points.var(axis=0).sum()))
@@ -322,11 +328,11 @@ def _search(
         pairs = _pairs(pose, points, surface)
         moved, pose = _step(pose, pairs, _weights(pairs, keep), generators, placed, size)
         if not (0.1 * size < _spread(pose, surface) < 10 * size):
-            return _Found(pose, np.inf, given)  # shrunk into the scan, or blown up until it is a plane
+            return _Found(pose, np.inf)  # shrunk into the scan, or blown up until it is a plane
         if moved < _MOVED:
             break
     distance = np.sort(_pairs(pose, points, surface).distance)
-    return _Found(pose, float(np.sqrt(np.mean(distance[: max(1, round(keep * len(distance)))] ** 2))), given)
+    return _Found(pose, float(np.sqrt(np.mean(distance[: max(1, round(keep * len(distance)))] ** 2))))
 
 
 def _best_starts(
@@ -338,9 +344,9 @@ def _best_starts(
     placed: Placed | None,
 ) -> list[_Found]:
     """The best few after a short search from each; the first pose, the one given, is always among them."""
-    found = [_search(pose, points, surface, kind, keep, placed, _FIRST_STEPS, i == 0) for i, pose in enumerate(poses)]
+    found = [_search(pose, points, surface, kind, keep, placed, _FIRST_STEPS) for pose in poses]
     found = found[:1] + sorted(found[1:], key=lambda one: one.score)[:_COARSE_BEST]
-    found = [_search(one.pose, points, surface, kind, keep, placed, _COARSE_STEPS, one.given) for one in found]
+    found = [_search(one.pose, points, surface, kind, keep, placed, _COARSE_STEPS) for one in found]
     return found[:1] + sorted(found[1:], key=lambda one: one.score)[:_REFINED]
 
 
@@ -427,14 +433,18 @@ def _step(
 # ------------------------------------------------------------------------------------------------------------- doubts
 
 
-def _other_answers(chosen: _Found, fine: list[_Found], template: _Moments) -> list[str]:
+def _angle(linear: Float[np.ndarray, "3 3"]) -> float:
+    """Degrees by which a similarity turns."""
+    turn = linear / np.cbrt(np.linalg.det(linear))
+    return float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
+
+
+def _other_answers(chosen: _Found, fine: list[_Found]) -> list[str]:
     """Two poses far from each other that fit alike: a sphere, say. The pose as given needs no such excuse."""
-    if chosen.given:
+    if _angle(chosen.pose.linear) < 2 * _NEARBY:
         return []
     for other in fine:
-        turn = other.pose.linear @ np.linalg.inv(chosen.pose.linear)
-        turn = turn / np.cbrt(np.linalg.det(turn))
-        angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
+        angle = _angle(other.pose.linear @ np.linalg.inv(chosen.pose.linear))
         if angle > _FAR_ROTATION and other.score < _ALIKE * chosen.score:
             return [
                 f"two poses fit alike ({chosen.score:.2g} and {other.score:.2g} mm), {angle:.0f} degrees apart: turn "

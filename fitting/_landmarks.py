@@ -2,9 +2,9 @@
 
 import csv
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -72,7 +72,9 @@ def read_landmarks(path: str | Path, *, scale: float = 1.0) -> dict[str, Float[n
     return landmarks
 
 
-def match_landmarks(on_scan: Mapping[str, ArrayLike], on_mesh: Mapping[str, ArrayLike]) -> Landmarks:
+def match_landmarks(
+    on_scan: Mapping[str, ArrayLike], on_mesh: Mapping[str, ArrayLike] | Mapping[str, int]
+) -> Landmarks:
     """Landmarks that both name, in the order of the first; capitals and blanks around a name make no difference.
 
     Args:
@@ -93,15 +95,15 @@ def match_landmarks(on_scan: Mapping[str, ArrayLike], on_mesh: Mapping[str, Arra
     return Landmarks(np.array(scan, np.float64), np.array(mesh))
 
 
-def place_landmarks(landmarks: Landmarks | tuple, mesh: js.ControlMesh) -> Placed:
+def place_landmarks(landmarks: Landmarks | tuple[Any, ...], mesh: js.ControlMesh) -> Placed:
     """Positions on both sides.
 
     Raises:
         ScanError: lengths differ, an index is no vertex, or a value is not finite; the text names the rows.
     """
-    given = Landmarks(*landmarks)
-    scan, on_mesh = np.asarray(given.on_scan, np.float64), np.asarray(given.on_mesh)
-    if on_mesh.ndim == 1 and np.issubdtype(on_mesh.dtype, np.integer):
+    first, second, *rest = landmarks
+    scan, on_mesh = np.asarray(first, np.float64), np.asarray(second)
+    if on_mesh.ndim == 1 and len(on_mesh) and np.issubdtype(on_mesh.dtype, np.integer):
         on_mesh = _vertices(on_mesh, mesh)
     on_mesh = on_mesh.astype(np.float64)
     for name, rows in (("on_scan", scan), ("on_mesh", on_mesh)):
@@ -111,7 +113,7 @@ def place_landmarks(landmarks: Landmarks | tuple, mesh: js.ControlMesh) -> Place
         if not np.isfinite(rows).all():
             bad = ", ".join(map(str, np.flatnonzero(~np.isfinite(rows).all(axis=1))))
             raise ScanError(f"landmarks: `{name}` is not finite in rows {bad}. Leave these landmarks out.")
-    weights = np.ones(len(scan)) if given.weights is None else np.asarray(given.weights, np.float64)
+    weights = np.ones(len(scan)) if not rest or rest[0] is None else np.asarray(rest[0], np.float64)
     if len(scan) != len(on_mesh) or weights.shape != (len(scan),):
         raise ScanError(
             f"landmarks: {len(scan)} on the scan, {len(on_mesh)} on the mesh, {weights.size} weights. Each place needs "
@@ -132,7 +134,7 @@ def _vertices(rows: Int[np.ndarray, "l"], mesh: js.ControlMesh) -> Float[np.ndar
     return mesh.vertices[rows]
 
 
-def _json_rows(path: Path, text: str):
+def _json_rows(path: Path, text: str) -> Iterator[tuple[str, str, Any]]:
     try:
         content = json.loads(text)
     except json.JSONDecodeError as error:
@@ -146,7 +148,7 @@ def _json_rows(path: Path, text: str):
             yield name, f"'{name}'", value
 
 
-def _csv_rows(path: Path, text: str):
+def _csv_rows(path: Path, text: str) -> Iterator[tuple[str, str, Any]]:
     for line, row in enumerate(csv.reader(text.splitlines()), 1):
         cells = [cell.strip() for cell in row]
         if not any(cells) or (line == 1 and [cell.casefold() for cell in cells[1:]] == ["x", "y", "z"]):

@@ -4,6 +4,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
+from ._correspondence import nearest_rows
+
 _NEIGHBOURS = 10
 _LOW = 0.2  # with 60 % of outliers a third of the surface's own points still lies below this quantile
 
@@ -25,7 +27,7 @@ def dense_points(points: Float[np.ndarray, "p 3"], spread: float = 1.7) -> Bool[
 
 def neighbour_distance(points: Float[np.ndarray, "p 3"], k: int = _NEIGHBOURS) -> Float[np.ndarray, "p"]:
     """Distance of every point to its `k`-th neighbour, in the unit of the points."""
-    return KDTree(points).query(points, k=[min(k + 1, len(points))], workers=-1)[0][:, 0]
+    return nearest_rows(KDTree(points), points, min(k + 1, len(points)))[0][:, -1]
 
 
 def one_a_cell(points: Float[np.ndarray, "p 3"], cell: float) -> Int[np.ndarray, "c"]:
