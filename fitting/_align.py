@@ -26,7 +26,7 @@ _REFINED = 3
 _MOVED = 1e-4  # of the size: a smaller step ends the search
 # Along the surface a pair pulls this much of what it pulls across: enough to hold what no point-to-plane row holds
 # (a sphere's rotation), too little to stop the slip that makes point-to-plane fast.
-_ALONG = 0.03
+_ALONG = 0.1
 _COUNTS = 4.0  # times the quantile `keep` of the distances: about 3 to 4 standard deviations
 _CUT = 4.685  # Tukey's, in robust standard deviations
 _MAD = 1.4826
