@@ -4,20 +4,21 @@ import warnings
 from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 import jaxsubdiv as js
 from jaxsubdiv._half_edges import half_edges
+from jaxsubdiv._mesh import vector_areas
 
 from ._correspondence import nearest_rows
-from ._mesh_topology import MeshTopology, face_topology
+from ._mesh_topology import face_topology
 from ._orient import flipped, orient, plane_fits
 from ._outliers import neighbour_distance
 from ._poisson import Implicit, poisson
-from ._remesh import Coarse, Dense, coarsen, paired, relaxed, rim_vertices
+from ._remesh import Coarse, Dense, coarsen, paired, relaxed
 from ._scan import Scan, ScanError
 
 FaceKind: TypeAlias = Literal["triangle", "quad"]
@@ -25,7 +26,7 @@ FaceKind: TypeAlias = Literal["triangle", "quad"]
 _LEAST_POINTS = 50
 _LEAST_FACES = 16
 _AT_MOST = 40_000  # points that are looked at: more change no coarse mesh
-_CELLS = 128  # along the longest side: a head's are 2 mm then
+_CELLS = 160  # along the longest side: a cortex needs them, or its folds grow together
 _NEIGHBOUR = 10  # the one whose distance tells the density
 _TURNS = 6
 # A point is dropped where it lies thinly and its neighbours make no plane: sparse but smooth parts stay.
@@ -34,10 +35,12 @@ _FAR_OFF = 5.0  # robust standard deviations from the surface
 _MAD = 1.4826
 # What is made up: farther from a point than this many times the distance to its tenth neighbour.
 _MADE_UP = 1.5
-_OPEN = 0.3  # part of the closed surface that is made up: a face lacks half, a head with a hole of 80 mm a fifth
+_RIM = 0.45  # of that distance: at a rim the surface ends this far past the last points
+_OPEN = 0.2  # part of the closed surface that is made up: a face lacks half; a head with a hole of 80 mm up to 0.17
 _BRIDGED = 0.03  # part of the surface: smaller gaps of an open scan are bridged too
 _TOLD = 0.01
 _CUT = 4.685
+_BENT = 0.2  # cosine
 
 
 class _Cloud(NamedTuple):
@@ -65,22 +68,23 @@ def control_mesh(
     """A coarse, even mesh on the scan, with outward normals: one part, manifold, wound outwards.
 
     Outliers are dropped, normals estimated (those of the scan are used where it has any) and turned outwards; a Poisson
-    surface bridges the holes, is cut back to the points where the scan is open, and coarsened to clusters of equal area.
-    Vertices are then put on the points, by local quadrics that average the noise away. `topology_of` tells what came
-    out.
+    surface bridges the holes, is cut back to the points where the scan is open, and coarsened to clusters of equal
+    area. Vertices are then put on the points, by local quadrics that average the noise away. `topology_of` tells what
+    came out.
 
     Args:
         scan: in mm. At most 40,000 of its points are looked at.
         faces: about how many.
         kind: "triangle"; or "quad", where an open mesh may keep a few triangles.
-        closed: True bridges every gap, False cuts every large one open. None decides: open where over 30 % of the closed
-            surface lies far from all points.
+        closed: True bridges every gap, False cuts every large one open. None decides: open where over 20 % of the
+            closed surface lies far from all points.
 
     Warns:
         UserWarning: other parts of the scan were left out; the text gives their shares.
 
     Raises:
-        ScanError: fewer than 50 points, all on a line or a plane, or no surface in them; faces too few for the topology.
+        ScanError: fewer than 50 points, all on a line or a plane, or no surface in them; faces too few for the
+            topology.
         ImportError: the extra `mesh` is missing.
 
     Source: Kazhdan 2006 (Poisson), Hoppe 1992 and Hou 2022 (normals), Valette 2004 (clusters).
@@ -128,7 +132,9 @@ def _reconstruct(scan: Scan) -> tuple[_Cloud, Implicit]:
     # What was an outlier among outliers shows once there is a surface.
     slope = np.linalg.norm(implicit.outward(cloud.points), axis=1)
     off = np.abs(implicit.at(cloud.points)) / np.maximum(slope, 0.1 * np.median(slope))
-    keep = off <= max(_FAR_OFF * _MAD * float(np.median(off)), cell)
+    wrong = off > max(_FAR_OFF * _MAD * float(np.median(off)), cell)
+    _, near = nearest_rows(KDTree(cloud.points), cloud.points, 2 * _NEIGHBOUR)
+    keep = ~wrong | (wrong[near].mean(axis=1) > 0.5)  # many side by side are a place that is too sharp for this surface
     cloud = cloud._replace(points=cloud.points[keep], normals=cloud.normals[keep], reach=cloud.reach[keep])
     return _settled(cloud, cell)
 
@@ -179,7 +185,7 @@ def _settled(cloud: _Cloud, cell: float) -> tuple[_Cloud, Implicit]:
     Where the spanning tree took a wrong turn the surface averages it out, and says so. Hou et al. 2022, iterative
     Poisson surface reconstruction, which starts from normals at random even.
     """
-    smoothing = max(1.5 * cell, cloud.spacing, cloud.noise)
+    smoothing = max(0.8 * cell, 0.5 * cloud.spacing, cloud.noise)
     normals = cloud.normals
     implicit = poisson(cloud.points, normals, cloud.areas, cell, smoothing)
     for _ in range(_TURNS):
@@ -258,10 +264,26 @@ def _cut_back(dense: Dense, cloud: _Cloud, tree: KDTree) -> Dense:
     if not away.any():
         return dense
     # The rim goes back to where the points end: as far as it was let out to tell made up from gaps between points.
-    distance = tree.query(dense.vertices, workers=-1)[0]
+    distance, row = tree.query(dense.vertices, workers=-1)
+    reach = np.maximum(cloud.reach[row], np.median(cloud.reach))
     to_gone = KDTree(dense.vertices[away]).query(dense.vertices, workers=-1)[0]
-    out = away | ((to_gone < _MADE_UP * np.median(cloud.reach)) & (distance > 0.7 * cloud.spacing + cloud.noise))
-    return Dense(dense.vertices, dense.faces[~out[dense.faces].any(axis=1)])
+    out = away | ((to_gone < _MADE_UP * reach) & (distance > _RIM * reach + cloud.noise))
+    kept = ~out[dense.faces].any(axis=1)
+    piece = _pieces(dense, ~kept)
+    area = np.bincount(piece + 1, dense.areas)[1:]
+    kept |= np.isin(piece, np.flatnonzero(area <= _BRIDGED * dense.areas[kept].sum()))
+    return Dense(dense.vertices, _without_pinches(dense.faces[kept]))
+
+
+def _without_pinches(faces: Int[np.ndarray, "t 3"]) -> Int[np.ndarray, "s 3"]:
+    """Faces less those at vertices where the rim touches itself, which is no manifold."""
+    while True:
+        sides = half_edges({3: faces, 4: np.zeros((0, 4), np.int64)})
+        on_rim = np.bincount(sides.edge)[sides.edge] == 1
+        pinched = np.bincount(sides.start[on_rim], minlength=int(faces.max(initial=0)) + 1) > 1
+        if not pinched.any():
+            return faces
+        faces = faces[~pinched[faces].any(axis=1)]
 
 
 def _pieces(dense: Dense, chosen: Bool[np.ndarray, "t"]) -> np.ndarray:
@@ -283,8 +305,8 @@ def _largest(dense: Dense, cloud: _Cloud) -> Dense:
     if others:
         shares = ", ".join(f"{100 * share:.0f} %" for share in others)
         warnings.warn(
-            f"the scan shows {1 + len(others)} parts; the control mesh has the largest alone. Left out: {shares} of the "
-            "surface.",
+            f"the scan shows {1 + len(others)} parts; the control mesh has the largest alone. Left out: {shares} of "
+            "the surface.",
             stacklevel=4,
         )
     used, at = np.unique(dense.faces[piece == order[0]], return_inverse=True)
@@ -302,7 +324,10 @@ def _onto_points(
     x = coarse.vertices
     sides = half_edges(coarse.faces)
     edge = float(np.linalg.norm(np.diff(x[sides.edges], axis=1), axis=2).mean())
-    width = max(0.4 * edge, 1.5 * cloud.spacing)
+    # Wide enough to average the noise, no wider than half the way to the next vertex: an edge would be rounded off.
+    width = float(
+        np.clip(1.6 * cloud.spacing + 2 * cloud.noise, 1.5 * cloud.spacing, max(0.4 * edge, 1.5 * cloud.spacing))
+    )
     normal = dense.normals()[KDTree(dense.vertices).query(x)[1]]
     k = int(np.clip(np.pi * (2 * width / cloud.spacing) ** 2, 12, 150))
     distance, rows = nearest_rows(KDTree(cloud.points), x, min(k, len(cloud.points)))
@@ -323,18 +348,37 @@ def _onto_points(
         scale = np.maximum(_MAD * np.median(np.where(near > 0.1, residual, np.nan_to_num(residual)), axis=1), 1e-6)
         weight = near * np.maximum(1 - (residual / (_CUT * scale[:, None])) ** 2, 0) ** 2
     # Enough points, on all sides, and no step that is larger than what the dense surface can be off.
-    centre = np.stack([(weight * u).sum(axis=1), (weight * v).sum(axis=1)], axis=1) / np.maximum(
-        weight.sum(axis=1), 1e-9
-    )[:, None]
+    centre = (
+        np.stack([(weight * u).sum(axis=1), (weight * v).sum(axis=1)], axis=1)
+        / np.maximum(weight.sum(axis=1), 1e-9)[:, None]
+    )
     step = found[:, 0] * width
     sure = (weight.sum(axis=1) > 4) & (np.linalg.norm(centre, axis=1) < 0.5) & (np.abs(step) < 0.3 * edge)
+    x = np.where(sure[:, None], x + step[:, None] * normal, x)
     turned = normal - found[:, 1:2] * first - found[:, 2:3] * second
     turned /= np.linalg.norm(turned, axis=1, keepdims=True)
-    sure_turn = sure & (np.einsum("vx,vx->v", turned, normal) > 0.7)
-    return (
-        np.where(sure[:, None], x + step[:, None] * normal, x),
-        np.where(sure_turn[:, None], turned, normal),
-    )
+    turned = np.where((sure & (np.einsum("vx,vx->v", turned, normal) > 0.7))[:, None], turned, normal)
+    return x, _agreeing(x, coarse, turned)
+
+
+def _agreeing(
+    x: Float[np.ndarray, "v 3"], coarse: Coarse, normals: Float[np.ndarray, "v 3"]
+) -> Float[np.ndarray, "v 3"]:
+    """The normals, but where a face would bend back on itself under one.
+
+    In a fold narrower than the faces the middle of the faces' own normals serves better than the true one.
+    """
+    own, least = np.zeros_like(x), np.ones(len(x))
+    for size in (3, 4):
+        rows = coarse.faces[size]
+        areas = vector_areas(x[rows])
+        unit = areas / np.maximum(np.linalg.norm(areas, axis=1, keepdims=True), np.finfo(float).tiny)
+        for corner in rows.T:
+            np.add.at(own, corner, areas)
+            np.minimum.at(least, corner, np.einsum("fx,fx->f", unit, normals[corner]))
+    length = np.linalg.norm(own, axis=1, keepdims=True)
+    own = np.divide(own, length, out=normals.copy(), where=length > 0)
+    return np.where((least < _BENT)[:, None], own, normals)
 
 
 def _tangents(normal: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"]]:

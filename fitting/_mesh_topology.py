@@ -29,8 +29,14 @@ class MeshTopology(NamedTuple):
         return self.boundary_loops == 0
 
     def __str__(self) -> str:
-        rims = "closed" if self.is_closed else f"open ({self.boundary_loops} boundary loop{'s' * (self.boundary_loops > 1)})"
-        return f"{self.parts} part{'s' * (self.parts > 1)}, {rims}, genus {self.genus}, Euler number {self.euler_number}"
+        rims = (
+            "closed"
+            if self.is_closed
+            else f"open ({self.boundary_loops} boundary loop{'s' * (self.boundary_loops > 1)})"
+        )
+        return (
+            f"{self.parts} part{'s' * (self.parts > 1)}, {rims}, genus {self.genus}, Euler number {self.euler_number}"
+        )
 
 
 def topology_of(mesh: js.ControlMesh) -> MeshTopology:

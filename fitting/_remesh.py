@@ -1,9 +1,10 @@
 """Coarse even meshes from dense ones: clusters of vertices, then triangles paired to quads, then relaxed."""
 
+import heapq
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.spatial import KDTree
 
@@ -11,9 +12,11 @@ from jaxsubdiv._half_edges import Faces, half_edges
 
 from ._mesh_topology import MeshTopology, face_topology
 
-_SOFTENED = 3  # rounds over the vertices
-_RELAXED = 5
+_SOFTENED = 10  # rounds along a rim: over some cells of the grid that it was cut on
+_RELAXED = 8
 _TRIES = (1.0, 1.04, 0.96, 1.1, 1.2)  # cluster counts, in parts of the wish: another one often cures a pinch
+_FINER = (2, 4, 8)
+_AT_MOST = 1.2  # of the faces asked for
 
 
 class Dense(NamedTuple):
@@ -57,7 +60,17 @@ def coarsen(dense: Dense, n_triangles: int, topology: MeshTopology) -> Coarse | 
             found = _clustered(dense, round(share * n_vertices))
         if _is_manifold(found) and face_topology(found.faces) == topology:
             return found
-    return _decimated(dense, n_triangles, topology)
+    for finer in _FINER:
+        # Deep folds lie closer than a cluster is wide: smaller ones keep the sheets apart, and are merged with care.
+        found = _clustered(dense, round(finer * (n_triangles / 2 + euler)))
+        if _is_manifold(found) and face_topology(found.faces) == topology:
+            break
+    else:
+        found = _decimated(dense, _FINER[-1] * n_triangles)
+        if not (_is_manifold(found) and face_topology(found.faces) == topology):
+            found = _compact(dense.vertices, dense.faces)
+    found = _collapsed(found, n_triangles)
+    return found if len(found.faces[3]) <= _AT_MOST * n_triangles else None
 
 
 def _clustered(dense: Dense, n_vertices: int) -> Coarse:
@@ -79,15 +92,70 @@ def _clustered(dense: Dense, n_vertices: int) -> Coarse:
     return _compact(centres, corners)
 
 
-def _decimated(dense: Dense, n_triangles: int, topology: MeshTopology) -> Coarse | None:
-    """Edges collapsed one by one, none that would change the topology: less even, so the second choice."""
-    import pyvista
-
+def _decimated(dense: Dense, n_triangles: int) -> Coarse:
+    """Edges collapsed by VTK, fast, none that would change the topology."""
     part = max(0.0, 1 - n_triangles / len(dense.faces))
-    found = _polydata(dense).decimate_pro(part, preserve_topology=True, splitting=False, boundary_vertex_deletion=True)
-    mesh = _compact(np.asarray(found.points, np.float64), np.asarray(pyvista.PolyData(found).regular_faces))
-    same = _is_manifold(mesh) and face_topology(mesh.faces) == topology
-    return mesh if same and len(mesh.faces[3]) < 1.5 * n_triangles + 20 else None
+    found = _polydata(dense).decimate_pro(part, preserve_topology=True, splitting=False, boundary_vertex_deletion=False)
+    return _compact(np.asarray(found.points, np.float64), np.asarray(found.regular_faces))
+
+
+def _collapsed(mesh: Coarse, n_triangles: int) -> Coarse:
+    """Edges collapsed one by one to their middle, the shortest first; none that would change the topology.
+
+    The link condition: the ends have no neighbours in common but the corners opposite of the edge (Dey et al. 1999).
+    """
+    x = list(mesh.vertices)
+    faces: dict[int, tuple[int, int, int]] = {i: (a, b, c) for i, (a, b, c) in enumerate(mesh.faces[3].tolist())}
+    around: list[set[int]] = [set() for _ in x]
+    for i, face in faces.items():
+        for v in face:
+            around[v].add(i)
+    sides = half_edges(mesh.faces)
+    rim = np.zeros(len(x), bool)
+    rim[sides.edges[np.bincount(sides.edge) == 1]] = True
+    heap = [(float(np.sum((x[a] - x[b]) ** 2)), a, b) for a, b in sides.edges.tolist()]
+    heapq.heapify(heap)
+    while heap and len(faces) > n_triangles:
+        length, a, b = heapq.heappop(heap)
+        both = around[a] & around[b]
+        if not both or length != float(np.sum((x[a] - x[b]) ** 2)):
+            continue  # gone, or longer than it was
+        near_a, near_b = ({v for i in around[k] for v in faces[i]} for k in (a, b))
+        if len((near_a & near_b) - {a, b}) != len(both) or len(near_a | near_b) < 6:
+            continue
+        if rim[a] and rim[b] and len(both) == 2:
+            continue  # a chord from rim to rim
+        place = x[a] if rim[a] and not rim[b] else x[b] if rim[b] and not rim[a] else (x[a] + x[b]) / 2
+        stay = (around[a] | around[b]) - both
+        if any(_turns_over(x, faces[i], (a, b), place) for i in stay):
+            continue
+        for i in both:
+            for v in faces.pop(i):
+                around[v].discard(i)
+        for i in around[b]:
+            p, q, r = (a if v == b else v for v in faces[i])
+            faces[i] = (p, q, r)
+        around[a] |= around[b]
+        around[b] = set()
+        x[a], rim[a] = place, rim[a] or rim[b]
+        for v in {v for i in around[a] for v in faces[i]} - {a}:
+            heapq.heappush(heap, (float(np.sum((x[a] - x[v]) ** 2)), a, v))
+    return _compact(np.array(x), np.array(list(faces.values())))
+
+
+def _turns_over(
+    x: list[Float[np.ndarray, "3"]],
+    face: tuple[int, int, int],
+    moved: tuple[int, int],
+    place: Float[np.ndarray, "3"],
+) -> bool:
+    """Whether the face turns by more than about 80 degrees, or becomes a sliver."""
+    before = [x[v] for v in face]
+    after = [place if v in moved else x[v] for v in face]
+    old, new = (np.cross(c[1] - c[0], c[2] - c[0]) for c in (before, after))
+    longest = max(float(np.sum((after[i] - after[i - 1]) ** 2)) for i in range(3))
+    size = float(np.sqrt(new @ new))
+    return bool(old @ new < 0.2 * np.sqrt(old @ old) * size or size < 0.1 * longest)
 
 
 def _polydata(dense: Dense):
@@ -124,7 +192,9 @@ def _pinched(mesh: Coarse) -> bool:
     sides = half_edges(mesh.faces)
     order = np.argsort(sides.start, kind="stable")
     after = {}
-    for v, a, b in zip(sides.start[order].tolist(), sides.end[order].tolist(), sides.before[order].tolist(), strict=True):
+    for v, a, b in zip(
+        sides.start[order].tolist(), sides.end[order].tolist(), sides.before[order].tolist(), strict=True
+    ):
         after.setdefault(v, {})[a] = b
     for ring in after.values():
         start = next((a for a in ring if a not in ring.values()), next(iter(ring)))
@@ -218,8 +288,8 @@ def relaxed(mesh: Coarse, dense: Dense, rounds: int = _RELAXED) -> Coarse:
     on_rim[rim] = True
     inner, along = _averages(sides.edges, n), _averages(rim, n)
     normals, tree = dense.normals(), KDTree(dense.vertices)
-    dense_rim = dense.vertices[rim_vertices({3: dense.faces, 4: np.zeros((0, 4), int)}, len(dense.vertices))]
-    edge_of_rim = KDTree(dense_rim) if on_rim.any() and len(dense_rim) else None
+    dense_rim = _smooth_rim(dense) if on_rim.any() else np.zeros((0, 3))
+    edge_of_rim = KDTree(dense_rim) if len(dense_rim) else None
     x = mesh.vertices.copy()
     for _ in range(rounds):
         moved = np.where(on_rim[:, None], x + 0.5 * (along @ x - x), x + 0.5 * (inner @ x - x))
@@ -227,6 +297,18 @@ def relaxed(mesh: Coarse, dense: Dense, rounds: int = _RELAXED) -> Coarse:
         if edge_of_rim is not None:
             x[on_rim] = dense_rim[edge_of_rim.query(moved[on_rim])[1]]
     return Coarse(x, mesh.faces)
+
+
+def _smooth_rim(dense: Dense) -> Float[np.ndarray, "r 3"]:
+    """The dense rim without the steps of its grid."""
+    sides = half_edges({3: dense.faces, 4: np.zeros((0, 4), np.int64)})
+    rim = sides.edges[np.bincount(sides.edge) == 1]
+    used, at = np.unique(rim, return_inverse=True)
+    along = _averages(at.reshape(-1, 2), len(used))
+    x = dense.vertices[used]
+    for _ in range(_SOFTENED):
+        x = x + 0.5 * (along @ x - x)
+    return x
 
 
 def _onto(
@@ -241,11 +323,3 @@ def _averages(edges: Int[np.ndarray, "e 2"], n: int) -> csr_matrix:
     matrix = coo_matrix((np.ones(both.shape[1]), (both[0], both[1])), shape=(n, n)).tocsr()
     count = np.maximum(np.asarray(matrix.sum(axis=1)).ravel(), 1)
     return csr_matrix(matrix.multiply(1 / count[:, None]))
-
-
-def rim_vertices(faces: Faces, n: int) -> Bool[np.ndarray, "v"]:
-    """Which of `n` vertices lie on a boundary edge."""
-    sides = half_edges(faces)
-    mask = np.zeros(n, bool)
-    mask[sides.edges[np.bincount(sides.edge) == 1]] = True
-    return mask
