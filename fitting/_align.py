@@ -36,7 +36,7 @@ _NEARBY = 30.0  # degrees
 _MIRRORED = 0.6
 _FITS = 0.004  # of the size: with so little left, no mirror is looked into
 _ALIKE = 1.1
-_FAR_ROTATION = 30.0  # degrees: two poses farther apart are two answers
+_FAR_ROTATION = 45.0  # degrees: two poses farther apart are two answers
 # Sizes that differ by more than this are no two people, but two units.
 _SAME_UNIT = 6.0
 _UNITS = {10.0: "cm and mm, or dm and cm", 25.4: "inches and mm", 100.0: "m and cm", 1000.0: "m and mm"}

@@ -94,7 +94,8 @@ def control_mesh(
     if faces < _LEAST_FACES:
         raise ValueError(f"`faces` must be {_LEAST_FACES} or more; got {faces}.")
     _need_extra()
-    cloud, implicit = _reconstruct(scan)
+    cloud = _cleaned(scan)
+    cloud, implicit = _reconstruct(cloud if scan.normals is None else _outwards(cloud))
     dense = _dense_surface(cloud, implicit, closed)
     topology = face_topology(_triangles(dense))
     coarse = coarsen(dense, faces if kind == "triangle" else 2 * faces, topology)
@@ -125,8 +126,18 @@ def _triangles(dense: Dense) -> dict[int, np.ndarray]:
 # ------------------------------------------------------------------------------------------------------ reconstruction
 
 
-def _reconstruct(scan: Scan) -> tuple[_Cloud, Implicit]:
-    cloud = _cleaned(scan)
+def _outwards(cloud: _Cloud) -> _Cloud:
+    """Normals of a closed scan that all point inwards are turned; an open one may well be seen from inside."""
+    if np.sum(cloud.areas[:, None] * (cloud.points - cloud.points.mean(axis=0)) * cloud.normals) > 0:
+        return cloud
+    turned, implicit = _settled(cloud._replace(normals=-cloud.normals), 3 * cloud.spacing)
+    if not _is_closed(turned, _contour(implicit, shut=True), KDTree(turned.points)):
+        return cloud
+    warnings.warn("the normals of the scan point inwards; they were turned.", stacklevel=3)
+    return turned
+
+
+def _reconstruct(cloud: _Cloud) -> tuple[_Cloud, Implicit]:
     cell = max(float(np.ptp(cloud.points, axis=0).max()) / _CELLS, 0.8 * cloud.spacing, 0.5 * cloud.noise)
     cloud, implicit = _settled(cloud, 2 * cell)
     # What was an outlier among outliers shows once there is a surface.
@@ -204,13 +215,15 @@ def _dense_surface(cloud: _Cloud, implicit: Implicit, closed: bool | None) -> De
     """The largest part of the surface, cut back to the points where it is open."""
     shut = _contour(implicit, shut=True)
     tree = KDTree(cloud.points)
-    if closed is None:
-        far = _made_up(shut, cloud, tree)[shut.faces].all(axis=1)
-        closed = bool(shut.areas[far].sum() < _OPEN * shut.areas.sum())
-    if closed:
+    if closed or (closed is None and _is_closed(cloud, shut, tree)):
         return _largest(shut, cloud)
     dense = _contour(implicit, shut=False)
     return _largest(_cut_back(dense, cloud, tree), cloud)
+
+
+def _is_closed(cloud: _Cloud, shut: Dense, tree: KDTree) -> bool:
+    far = _made_up(shut, cloud, tree)[shut.faces].all(axis=1)
+    return bool(shut.areas[far].sum() < _OPEN * shut.areas.sum())
 
 
 def _contour(implicit: Implicit, shut: bool) -> Dense:
@@ -228,7 +241,7 @@ def _contour(implicit: Implicit, shut: bool) -> Dense:
     found = grid.contour([0.0], "value", method="flying_edges")
     if found.n_cells == 0:
         raise ScanError("no surface: the points are scattered in space. Was the right file read?")
-    vertices, faces = np.asarray(found.points, np.float64), np.asarray(found.regular_faces)
+    vertices, faces = np.asarray(found.points, np.float64), np.asarray(found.regular_faces, np.int32)
     vertices, faces = _merged(vertices, faces)
     dense = Dense(vertices, faces)
     middle = vertices[faces].mean(axis=1)
@@ -256,7 +269,7 @@ def _made_up(dense: Dense, cloud: _Cloud, tree: KDTree) -> Bool[np.ndarray, "v"]
 def _cut_back(dense: Dense, cloud: _Cloud, tree: KDTree) -> Dense:
     """Without what is made up in large pieces; small gaps stay bridged."""
     far = _made_up(dense, cloud, tree)
-    piece = _pieces(dense, far[dense.faces].all(axis=1))
+    piece = _pieces(dense, np.asarray(far[dense.faces].all(axis=1)))
     area = np.bincount(piece + 1, dense.areas)[1:]
     gone = np.isin(piece, np.flatnonzero(area > _BRIDGED * dense.areas[piece < 0].sum()))
     away = np.zeros(len(dense.vertices), bool)

@@ -56,15 +56,15 @@ def poisson(
     shape = np.ceil((high - low + 2 * pad) / cell).astype(int) + 1
     origin = low - pad
     field = _spread(points, normals * areas[:, None], origin, cell, shape)
-    divergence = sum(np.gradient(field[axis], cell, axis=axis) for axis in range(3))
+    divergence = np.sum([np.gradient(field[axis], cell, axis=axis) for axis in range(3)], axis=0)
     waves = [np.pi * np.arange(n) / n for n in shape]
     x, y, z = np.meshgrid(*waves, indexing="ij", sparse=True)
     laplacian = (2 * np.cos(x) + 2 * np.cos(y) + 2 * np.cos(z) - 6) / cell**2
     blur = np.exp(-(x**2 + y**2 + z**2) / 2 * (smoothing / cell) ** 2)
     laplacian[0, 0, 0] = 1
-    spectrum = dctn(divergence.astype(np.float32)) * (blur / laplacian).astype(np.float32)
+    spectrum = np.asarray(dctn(divergence.astype(np.float32))) * (blur / laplacian).astype(np.float32)
     spectrum[0, 0, 0] = 0
-    values = -idctn(spectrum)
+    values = -np.asarray(idctn(spectrum))
     found = Implicit(values, origin, cell)
     return found._replace(values=values - np.float32(_median(found.at(points), areas)))
 

@@ -1,6 +1,7 @@
 """Coarse even meshes from dense ones: clusters of vertices, then triangles paired to quads, then relaxed."""
 
 import heapq
+import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from ._mesh_topology import MeshTopology, face_topology
 _SOFTENED = 10  # rounds along a rim: over some cells of the grid that it was cut on
 _RELAXED = 8
 _TRIES = (1.0, 1.04, 0.96, 1.1, 1.2)  # cluster counts, in parts of the wish: another one often cures a pinch
-_FINER = (2, 4, 8)
+_FINER = (2, 4, 8, 16, 32)
 _AT_MOST = 1.2  # of the faces asked for
 
 
@@ -62,13 +63,11 @@ def coarsen(dense: Dense, n_triangles: int, topology: MeshTopology) -> Coarse | 
             return found
     for finer in _FINER:
         # Deep folds lie closer than a cluster is wide: smaller ones keep the sheets apart, and are merged with care.
-        found = _clustered(dense, round(finer * (n_triangles / 2 + euler)))
+        found = _clustered(dense, round(finer * max(n_triangles / 2 + euler, n_triangles / 4)))
         if _is_manifold(found) and face_topology(found.faces) == topology:
             break
     else:
-        found = _decimated(dense, _FINER[-1] * n_triangles)
-        if not (_is_manifold(found) and face_topology(found.faces) == topology):
-            found = _compact(dense.vertices, dense.faces)
+        return None
     found = _collapsed(found, n_triangles)
     return found if len(found.faces[3]) <= _AT_MOST * n_triangles else None
 
@@ -77,8 +76,10 @@ def _clustered(dense: Dense, n_vertices: int) -> Coarse:
     """One vertex for each of `n_vertices` clusters of equal area. Valette & Chassery 2004, by pyacvd."""
     import pyacvd
 
-    clustering = pyacvd.Clustering(_polydata(dense))
-    clustering.cluster(n_vertices)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # pyacvd 0.4 uses a name that pyvista 0.49 deprecates: nothing a caller can do
+        clustering = pyacvd.Clustering(_polydata(dense))
+        clustering.cluster(n_vertices)
     cluster = np.asarray(clustering.clusters)
     # Dense faces between three clusters, as they are wound; the library itself leaves a few faces the wrong way round.
     # Where two such faces close on each other, a cluster has no more than two neighbours: both faces go, and it goes.
@@ -90,13 +91,6 @@ def _clustered(dense: Dense, n_vertices: int) -> Coarse:
     total = np.bincount(cluster, weights)
     centres = np.stack([np.bincount(cluster, weights * dense.vertices[:, x]) / total for x in range(3)], axis=1)
     return _compact(centres, corners)
-
-
-def _decimated(dense: Dense, n_triangles: int) -> Coarse:
-    """Edges collapsed by VTK, fast, none that would change the topology."""
-    part = max(0.0, 1 - n_triangles / len(dense.faces))
-    found = _polydata(dense).decimate_pro(part, preserve_topology=True, splitting=False, boundary_vertex_deletion=False)
-    return _compact(np.asarray(found.points, np.float64), np.asarray(found.regular_faces))
 
 
 def _collapsed(mesh: Coarse, n_triangles: int) -> Coarse:
