@@ -14,7 +14,7 @@ from jaxsubdiv._half_edges import half_edges
 from jaxsubdiv._mesh import vector_areas
 
 from ._correspondence import nearest_rows
-from ._mesh_topology import face_topology
+from ._mesh_topology import MeshTopology, face_topology
 from ._orient import flipped, orient, plane_fits
 from ._outliers import neighbour_distance
 from ._poisson import Implicit, poisson
@@ -29,6 +29,7 @@ _AT_MOST = 40_000  # points that are looked at: more change no coarse mesh
 _CELLS = 160  # along the longest side: a cortex needs them, or its folds grow together
 _NEIGHBOUR = 10  # the one whose distance tells the density
 _TURNS = 6
+_SMOOTHER = (1.0, 1.5, 2.5)
 # A point is dropped where it lies thinly and its neighbours make no plane: sparse but smooth parts stay.
 _THIN, _THICK = 1.7, 0.15
 _FAR_OFF = 5.0  # robust standard deviations from the surface
@@ -95,9 +96,7 @@ def control_mesh(
         raise ValueError(f"`faces` must be {_LEAST_FACES} or more; got {faces}.")
     _need_extra()
     cloud = _cleaned(scan)
-    cloud, implicit = _reconstruct(cloud if scan.normals is None else _outwards(cloud))
-    dense = _dense_surface(cloud, implicit, closed)
-    topology = face_topology(_triangles(dense))
+    cloud, dense, topology = _simplest(cloud if scan.normals is None else _outwards(cloud), closed)
     coarse = coarsen(dense, faces if kind == "triangle" else 2 * faces, topology)
     if coarse is None:
         raise ScanError(
@@ -137,7 +136,28 @@ def _outwards(cloud: _Cloud) -> _Cloud:
     return turned
 
 
-def _reconstruct(cloud: _Cloud) -> tuple[_Cloud, Implicit]:
+def _simplest(cloud: _Cloud, closed: bool | None) -> tuple[_Cloud, Dense, MeshTopology]:
+    """The surface at the least smoothing, or at more where that takes handles away.
+
+    Noise and stray points make handles as narrow as the grid; a true one is wider.
+    """
+    cloud, cell = _settled_without_strays(cloud)
+    best, left_out = None, []
+    for factor in _SMOOTHER:
+        settled, implicit = _settled(cloud, cell, factor)
+        dense, others = _dense_surface(settled, implicit, closed)
+        topology = face_topology(_triangles(dense))
+        if best is None or topology.genus < best[2].genus:
+            best, left_out = (settled, dense, topology), others
+        if topology.genus == 0:
+            break
+    assert best is not None
+    _tell_other_parts(left_out)
+    return best
+
+
+def _settled_without_strays(cloud: _Cloud) -> tuple[_Cloud, float]:
+    """The cloud less what is far off its surface, and the grid's spacing for what is left."""
     cell = max(float(np.ptp(cloud.points, axis=0).max()) / _CELLS, 0.8 * cloud.spacing, 0.5 * cloud.noise)
     cloud, implicit = _settled(cloud, 2 * cell)
     # What was an outlier among outliers shows once there is a surface.
@@ -147,7 +167,7 @@ def _reconstruct(cloud: _Cloud) -> tuple[_Cloud, Implicit]:
     _, near = nearest_rows(KDTree(cloud.points), cloud.points, 2 * _NEIGHBOUR)
     keep = ~wrong | (wrong[near].mean(axis=1) > 0.5)  # many side by side are a place that is too sharp for this surface
     cloud = cloud._replace(points=cloud.points[keep], normals=cloud.normals[keep], reach=cloud.reach[keep])
-    return _settled(cloud, cell)
+    return cloud, cell
 
 
 def _cleaned(scan: Scan) -> _Cloud:
@@ -190,13 +210,13 @@ def _check_extent(points: Float[np.ndarray, "p 3"]) -> None:
         raise ScanError(f"all points lie on {where}: no surface follows. Was a coordinate lost when they were written?")
 
 
-def _settled(cloud: _Cloud, cell: float) -> tuple[_Cloud, Implicit]:
+def _settled(cloud: _Cloud, cell: float, smoother: float = 1.0) -> tuple[_Cloud, Implicit]:
     """The Poisson surface, with normals turned that point against it, until hardly any does.
 
     Where the spanning tree took a wrong turn the surface averages it out, and says so. Hou et al. 2022, iterative
     Poisson surface reconstruction, which starts from normals at random even.
     """
-    smoothing = max(0.8 * cell, 0.5 * cloud.spacing, cloud.noise)
+    smoothing = smoother * max(0.8 * cell, 0.5 * cloud.spacing, cloud.noise)
     normals = cloud.normals
     implicit = poisson(cloud.points, normals, cloud.areas, cell, smoothing)
     for _ in range(_TURNS):
@@ -211,14 +231,14 @@ def _settled(cloud: _Cloud, cell: float) -> tuple[_Cloud, Implicit]:
 # ------------------------------------------------------------------------------------------------- open or closed
 
 
-def _dense_surface(cloud: _Cloud, implicit: Implicit, closed: bool | None) -> Dense:
-    """The largest part of the surface, cut back to the points where it is open."""
+def _dense_surface(cloud: _Cloud, implicit: Implicit, closed: bool | None) -> tuple[Dense, list[float]]:
+    """The largest part of the surface, cut back to the points where it is open, and the shares of the other parts."""
     shut = _contour(implicit, shut=True)
     tree = KDTree(cloud.points)
     if closed or (closed is None and _is_closed(cloud, shut, tree)):
-        return _largest(shut, cloud)
+        return _largest(shut)
     dense = _contour(implicit, shut=False)
-    return _largest(_cut_back(dense, cloud, tree), cloud)
+    return _largest(_cut_back(dense, cloud, tree))
 
 
 def _is_closed(cloud: _Cloud, shut: Dense, tree: KDTree) -> bool:
@@ -309,21 +329,23 @@ def _pieces(dense: Dense, chosen: Bool[np.ndarray, "t"]) -> np.ndarray:
     return piece
 
 
-def _largest(dense: Dense, cloud: _Cloud) -> Dense:
-    """The part that has the most area, and a warning about others that are no specks."""
+def _largest(dense: Dense) -> tuple[Dense, list[float]]:
+    """The part that has the most area, and the shares of the others that are no specks."""
     piece = _pieces(dense, np.ones(len(dense.faces), bool))
     area = np.bincount(piece, dense.areas)
     order = np.argsort(area)[::-1]
-    others = [area[i] / area.sum() for i in order[1:] if area[i] > _TOLD * area.sum()]
-    if others:
-        shares = ", ".join(f"{100 * share:.0f} %" for share in others)
+    shares = [float(area[i] / area.sum()) for i in order[1:] if area[i] > _TOLD * area.sum()]
+    used, at = np.unique(dense.faces[piece == order[0]], return_inverse=True)
+    return Dense(dense.vertices[used], at.reshape(-1, 3)), shares
+
+
+def _tell_other_parts(shares: list[float]) -> None:
+    if shares:
         warnings.warn(
-            f"the scan shows {1 + len(others)} parts; the control mesh has the largest alone. Left out: {shares} of "
-            "the surface.",
+            f"the scan shows {1 + len(shares)} parts; the control mesh has the largest alone. Left out: "
+            f"{', '.join(f'{100 * share:.0f} %' for share in shares)} of the surface.",
             stacklevel=4,
         )
-    used, at = np.unique(dense.faces[piece == order[0]], return_inverse=True)
-    return Dense(dense.vertices[used], at.reshape(-1, 3))
 
 
 # ------------------------------------------------------------------------------------------------------------ placing

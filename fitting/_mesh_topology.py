@@ -49,13 +49,14 @@ def face_topology(faces: Faces) -> MeshTopology:
     sides = half_edges(faces)
     n = int(sides.start.max(initial=-1)) + 1
     used = np.unique(sides.start)
-    label = _labels(sides.edges, n)
+    label = component_labels(sides.edges, n)
     parts = len(np.unique(label[used]))
     rim = sides.edges[np.bincount(sides.edge, minlength=len(sides.edges)) == 1]
-    loops = len(np.unique(_labels(rim, n)[rim.ravel()])) if len(rim) else 0
+    loops = len(np.unique(component_labels(rim, n)[rim.ravel()])) if len(rim) else 0
     euler = len(used) - len(sides.edges) + sum(len(rows) for rows in faces.values())
     return MeshTopology(parts, loops, (2 * parts - loops - euler) // 2, euler)
 
 
-def _labels(edges: Int[np.ndarray, "e 2"], n: int) -> Int[np.ndarray, "v"]:
+def component_labels(edges: Int[np.ndarray, "e 2"], n: int) -> Int[np.ndarray, "v"]:
+    """Of each of `n` nodes the component that it lies in."""
     return connected_components(coo_matrix((np.ones(len(edges)), tuple(edges.T)), shape=(n, n)), directed=False)[1]

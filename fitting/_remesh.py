@@ -11,12 +11,13 @@ from scipy.spatial import KDTree
 
 from jaxsubdiv._half_edges import Faces, half_edges
 
-from ._mesh_topology import MeshTopology, face_topology
+from ._mesh_topology import MeshTopology, component_labels, face_topology
 
 _SOFTENED = 10  # rounds along a rim: over some cells of the grid that it was cut on
 _RELAXED = 8
 _TRIES = (1.0, 1.04, 0.96, 1.1, 1.2)  # cluster counts, in parts of the wish: another one often cures a pinch
 _FINER = (2, 4, 8, 16, 32)
+_COUNT = 0.03  # a rim, or a bubble that went, leaves fewer faces: asked for once more
 _AT_MOST = 1.2  # of the faces asked for
 
 
@@ -56,8 +57,8 @@ def coarsen(dense: Dense, n_triangles: int, topology: MeshTopology) -> Coarse | 
         # Of a closed mesh F = 2 (V - euler); a rim has its vertices at half the faces.
         n_vertices = max(4, round(factor * share * (n_triangles / 2 + euler)))
         found = _clustered(dense, n_vertices)
-        if topology.boundary_loops and share == 1.0 and len(found.faces[3]):
-            share = min(n_triangles / len(found.faces[3]), 2.0)
+        if share == 1.0 and abs(len(found.faces[3]) / n_triangles - factor) > _COUNT and len(found.faces[3]):
+            share = min(factor * n_triangles / len(found.faces[3]), 2.0)
             found = _clustered(dense, round(share * n_vertices))
         if _is_manifold(found) and face_topology(found.faces) == topology:
             return found
@@ -90,7 +91,7 @@ def _clustered(dense: Dense, n_vertices: int) -> Coarse:
     weights = clustering.area
     total = np.bincount(cluster, weights)
     centres = np.stack([np.bincount(cluster, weights * dense.vertices[:, x]) / total for x in range(3)], axis=1)
-    return _compact(centres, corners)
+    return _largest_part(_compact(centres, corners))
 
 
 def _collapsed(mesh: Coarse, n_triangles: int) -> Coarse:
@@ -150,6 +151,22 @@ def _turns_over(
     longest = max(float(np.sum((after[i] - after[i - 1]) ** 2)) for i in range(3))
     size = float(np.sqrt(new @ new))
     return bool(old @ new < 0.2 * np.sqrt(old @ old) * size or size < 0.1 * longest)
+
+
+def _largest_part(mesh: Coarse) -> Coarse:
+    """The part with the most faces, where parts that touch in a vertex alone are two.
+
+    A bubble on a neck that is narrower than a cluster ends like that.
+    """
+    triangles = mesh.faces[3]
+    sides = half_edges(mesh.faces)
+    order = np.argsort(sides.edge, kind="stable")
+    twice = np.flatnonzero(np.bincount(sides.edge) == 2)
+    at = np.searchsorted(sides.edge[order], twice)
+    one, two = order[at], order[at + 1]
+    part = component_labels(np.stack([sides.face[one], sides.face[two]], axis=1), len(triangles))
+    triangles = triangles[part == np.bincount(part).argmax()]
+    return _compact(mesh.vertices, triangles)
 
 
 def _polydata(dense: Dense):
