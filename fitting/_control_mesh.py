@@ -28,6 +28,7 @@ _LEAST_FACES = 16
 _AT_MOST = 40_000  # points that are looked at: more change no coarse mesh
 _CELLS = 160  # along the longest side: a cortex needs them, or its folds grow together
 _NEIGHBOUR = 10  # the one whose distance tells the density
+_COARSE_CELLS = 50
 _TURNS = 6
 _SMOOTHER = (1.0, 1.5, 2.5)
 # A point is dropped where it lies thinly and its neighbours make no plane: sparse but smooth parts stay.
@@ -193,9 +194,23 @@ def _cleaned(scan: Scan) -> _Cloud:
     normals, _, near = plane_fits(points, int(np.clip(16 * (noise / (0.12 * np.median(reach))) ** 2, 16, 60)))
     if given is not None and (given[rows] != 0).any(axis=1).mean() > 0.9:
         normals = np.where(flipped(normals, given[rows])[:, None], -normals, normals)
-    else:
-        normals = orient(points, normals, near)
-    return _Cloud(points, normals, reach, noise)
+        return _Cloud(points, normals, reach, noise)
+    # A tree may turn all of what lies past a crease over, and no later step undoes that: of three ways to begin the one
+    # whose surface follows its normals best is taken.
+    away = points - points.mean(axis=0)
+    starts = [orient(points, normals, near, across) for across in (True, False)]
+    starts.append(np.where(flipped(normals, away)[:, None], -normals, normals))
+    cell = max(float(np.ptp(points, axis=0).max()) / _COARSE_CELLS, noise)
+    settled = [_settled(_Cloud(points, start, reach, noise), cell) for start in starts]
+    return max(settled, key=_agreement)[0]
+
+
+def _agreement(settled: tuple[_Cloud, Implicit]) -> float:
+    """Mean cosine between the normals and what the surface has there."""
+    cloud, implicit = settled
+    out = implicit.outward(cloud.points)
+    length = np.maximum(np.linalg.norm(out, axis=1), np.finfo(float).tiny)
+    return float(np.mean(np.einsum("px,px->p", out, cloud.normals) / length))
 
 
 def _check_extent(points: Float[np.ndarray, "p 3"]) -> None:

@@ -23,22 +23,31 @@ def plane_fits(
 
 
 def orient(
-    points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"], neighbours: Int[np.ndarray, "p k"]
+    points: Float[np.ndarray, "p 3"],
+    normals: Float[np.ndarray, "p 3"],
+    neighbours: Int[np.ndarray, "p k"],
+    across_creases: bool = True,
 ) -> Float[np.ndarray, "p 3"]:
     """Normals turned so that neighbours agree, and then outwards.
 
     Agreement spreads along the spanning tree of neighbours whose planes are most alike; every part of the tree is
     turned so that it encloses volume rather than lacks it.
 
-    Source: Hoppe et al. 1992, section 3.3; Xie et al. 2003 for planes that are alike across a crease (the normal is
-    mirrored at the line from point to point before it is compared).
+    Args:
+        points: positions.
+        normals: unit, of either sign.
+        neighbours: rows of the nearest points, each point's own first.
+        across_creases: mirror a normal at the line from point to point before it is compared, which is right on spheres
+            and at creases that are seen well; False compares the normals as they are.
+
+    Source: Hoppe et al. 1992, section 3.3; Xie et al. 2003 for the mirror.
     """
     n, k = neighbours.shape
     a, b = np.repeat(np.arange(n), k - 1), neighbours[:, 1:].ravel()
     line = points[b] - points[a]
     square = np.maximum(np.einsum("ex,ex->e", line, line), np.finfo(float).tiny)
-    mirrored = normals[a] - 2 * (np.einsum("ex,ex->e", normals[a], line) / square)[:, None] * line
-    agree = np.einsum("ex,ex->e", mirrored, normals[b])
+    mirrored = 2.0 * across_creases * (np.einsum("ex,ex->e", normals[a], line) / square)[:, None] * line
+    agree = np.einsum("ex,ex->e", normals[a] - mirrored, normals[b])
     cost = 1.0001 - np.abs(agree)
     # Every pair once: both directions would be summed, which makes the cost of mutual neighbours double.
     low, high = np.minimum(a, b), np.maximum(a, b)

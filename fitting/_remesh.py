@@ -159,6 +159,8 @@ def _largest_part(mesh: Coarse) -> Coarse:
     A bubble on a neck that is narrower than a cluster ends like that.
     """
     triangles = mesh.faces[3]
+    if len(triangles) == 0:
+        return mesh
     sides = half_edges(mesh.faces)
     order = np.argsort(sides.edge, kind="stable")
     twice = np.flatnonzero(np.bincount(sides.edge) == 2)
