@@ -1,10 +1,18 @@
 """Fit control meshes of `jaxsubdiv` surfaces to scanned point clouds."""
 
+from ._align import Alignment as Alignment
+from ._align import align as align
+from ._control_mesh import control_mesh as control_mesh
 from ._correspondence import closest_points as closest_points
 from ._example import example as example
 from ._fit import Sweep as Sweep
 from ._fit import fit as fit
 from ._free import Free as Free
+from ._landmarks import Landmarks as Landmarks
+from ._landmarks import match_landmarks as match_landmarks
+from ._landmarks import read_landmarks as read_landmarks
+from ._mesh_topology import MeshTopology as MeshTopology
+from ._mesh_topology import topology_of as topology_of
 from ._picture import draw_fit as draw_fit
 from ._posterior import Uncertainty as Uncertainty
 from ._refit import Refit as Refit

@@ -252,25 +252,11 @@ def largest_part(vertices: np.ndarray, faces: np.ndarray) -> Trimesh:
     return max(parts, key=lambda part: part.area)
 
 
-# To be removed for `fitting.align(control, scan, kind="similarity")` once there is one; nricp is given the same.
-def align(mesh: Trimesh, scan: Float[np.ndarray, "p 3"], keep: float = 0.4, iterations: int = 60) -> Trimesh:
-    """The mesh moved to the scan by a similarity: trimmed ICP, point to plane, over the part `keep` that is nearest."""
-    rng = np.random.default_rng(0)
-    points = rng.permutation(scan)[:3000]
-    x, n = sample(mesh, 10_000, rng)
-    vertices, normals = np.array(mesh.vertices), np.array(mesh.vertex_normals)
-    for _ in range(iterations):
-        distance, i = KDTree(x).query(points)
-        near = distance <= np.quantile(distance, keep)
-        i, gap = i[near], points[near] - x[i[near]]
-        centre = x[i].mean(axis=0)
-        arm = x[i] - centre
-        rows = np.column_stack([np.cross(arm, n[i]), np.sum(arm * n[i], axis=1), n[i]])
-        turn, grow, shift = np.split(np.linalg.lstsq(rows, np.sum(gap * n[i], axis=1))[0], [3, 4])
-        rotation = Rotation.from_rotvec(turn)
-        x, vertices = (np.exp(grow) * rotation.apply(rows - centre) + centre + shift for rows in (x, vertices))
-        n, normals = rotation.apply(n), rotation.apply(normals)
-    return Trimesh(vertices, mesh.faces, vertex_normals=normals, process=False)
+def align(mesh: Trimesh, scan: Float[np.ndarray, "p 3"]) -> Trimesh:
+    """The mesh moved to the scan by a similarity, the same for every method that starts from a template."""
+    control = js.ControlMesh(mesh.vertices, mesh.faces, mesh.vertex_normals)
+    moved = fitting.align(control, fitting.Scan(scan), kind="similarity").mesh
+    return Trimesh(moved.vertices, mesh.faces, vertex_normals=moved.normals, process=False)
 
 
 # Another method, a least-squares fit of a Loop surface say, is one more function and one more row here.
