@@ -15,17 +15,20 @@ from ._linalg import take
 Matrix: TypeAlias = Any
 """A `scipy.sparse.csr_array`: a row a new vertex, a column an old one. scipy is loaded by the first linear scheme."""
 
+Term: TypeAlias = tuple[Any, Any, Any]
+"""Rows, columns and weights of some entries, each of which may be broadcast against the others."""
+
 # Rows are padded to these lengths, so that few groups are compiled. They are those of the regular rules: 2 and 3 on
 # boundaries, 4 in a face, 6 (Catmull-Clark), 7 (Loop), 8 (butterfly), 9 (Catmull-Clark, Doo-Sabin), 16 (Kobbelt).
 _LENGTHS = np.array([1, 2, 4, 7, 9, 13, 16, 24, 32])
 
 
-def entries(shape: tuple[int, int], *terms: tuple[Any, Any, Any]) -> Matrix:
+def entries(shape: tuple[int, int], *terms: Term) -> Matrix:
     """A matrix from its entries; those on one place add up, and those of a negative column are left out.
 
     Args:
         shape: of the matrix.
-        terms: `(rows, columns, weights)`, each of which may be broadcast against the others.
+        terms: `(rows, columns, weights)`.
     """
     import scipy.sparse  # here and not above: the schemes of points and normals never need it
 

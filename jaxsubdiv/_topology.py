@@ -6,7 +6,7 @@ The tables of the schemes of points and normals are integers alone; those of lin
 """
 
 import operator
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -79,7 +79,8 @@ class Topology(eqx.Module):
     of control face `i` of a size are the rows `i 4^L` to `(i+1) 4^L - 1` of that size. Catmull-Clark's first level
     makes three quads of a triangle, which then stand before those of the quads. A dual scheme has no such order."""
     fans: Fans | None
-    """Corners around the vertices of the last level; only where the normals are those of the refined mesh."""
+    """Corners around the vertices of the last level, its polygons not yet cut into triangles; only where the normals
+    are those of the refined mesh."""
     limit: LimitMasks | None
     """Only where they were asked for."""
     mesh_normals: bool = eqx.field(static=True)
@@ -97,16 +98,14 @@ class Topology(eqx.Module):
 class BuildsTables(Protocol):
     """What the tables need to know of a scheme."""
 
-    @property
-    def takes(self) -> tuple[int, ...]: ...
+    takes: ClassVar[tuple[int, ...]]
+    uses_normals: ClassVar[bool]
+    takes_creases: ClassVar[bool]
+
     @property
     def tables_for(self) -> str: ...
     @property
     def recomputes_normals(self) -> bool: ...
-    @property
-    def uses_normals(self) -> bool: ...
-    @property
-    def takes_creases(self) -> bool: ...
     def level(self, stage: Stage, recompute: bool) -> AbstractLevel: ...
     def split(self, stage: Stage) -> Stage: ...
     def limit(self, stage: Stage) -> LimitMasks: ...
@@ -161,7 +160,7 @@ def build_topology(
         control_fans=mesh_fans(len(mesh.vertices), mesh.half_edges),
         control_faces=jax.tree.map(as_table, mesh.faces),
         faces=jax.tree.map(as_table, faces),
-        fans=None if scheme.uses_normals else mesh_fans(stage.n_vertices, half_edges(faces)),
+        fans=None if scheme.uses_normals else mesh_fans(stage.n_vertices, half_edges(stage.faces)),
         limit=scheme.limit(stage) if limit else None,
         mesh_normals=mesh_normals,
         built_for=scheme.tables_for,

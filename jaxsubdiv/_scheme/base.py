@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._control import strong_float
 from .._linalg import largest, take, unit, unit_or
-from .._masks import Matrix, as_masks, stack
+from .._masks import Matrix, as_masks, identity, stack
 from .._normals import Boundary, Weights, chord_normals, fan_normals, ring_sum
 from .._stage import Sides, Stage, hybrid_split, sides_of
 from .._topology import AbstractLevel, Level, LimitMasks, MaskLevel, point_normal_level
@@ -58,22 +58,24 @@ class AbstractScheme(eqx.Module):
     the level's number, or other levels.
     """
 
-    h: eqx.AbstractVar[Float[Array, "..."] | None]
-    """Tangent length; None in schemes that have none."""
+    h: eqx.AbstractVar[Any]
+    """Tangent length, `Float[Array, ""]` or one a level; None in schemes that have none."""
     weights: eqx.AbstractVar[Weights]
     """How corner normals are weighed in (6)."""
 
     takes: ClassVar[tuple[int, ...]] = (3, 4)
     """Numbers of corners of the faces that it takes."""
-    interpolates: eqx.AbstractClassVar[bool]
+    interpolates: ClassVar[bool]
     """Whether control vertices stay where they are."""
-    is_linear: eqx.AbstractClassVar[bool]
+    is_linear: ClassVar[bool]
     """Whether new vertices are weighted sums of the control vertices, with weights that the faces alone decide."""
-    uses_normals: eqx.AbstractClassVar[bool]
+    uses_normals: ClassVar[bool]
     """Whether the surface depends on the control normals."""
+    is_primal: ClassVar[bool] = True
+    """Whether the vertices of a level are the first of the next one, moved or not."""
     takes_creases: ClassVar[bool] = False
     """Whether `build_topology` may be given creases."""
-    order: eqx.AbstractClassVar[int]
+    order: ClassVar[int]
     """Power of the edge length by which the first new vertices come closer to a smooth surface through the control
     vertices (with its own normals), on regular meshes."""
 
@@ -111,7 +113,6 @@ class AbstractScheme(eqx.Module):
 class AbstractPointNormalScheme(AbstractScheme):
     """An interpolating scheme of points and normals: every face into four, normals by (4)-(6)."""
 
-    h: eqx.AbstractVar[Float[Array, "..."]]
     boundary: eqx.AbstractVar[Boundary]
     """Where the normal of a new boundary vertex comes from."""
 
@@ -187,6 +188,10 @@ class AbstractLinearScheme(AbstractScheme):
 
 class AbstractPrimalScheme(AbstractLinearScheme):
     """A linear scheme that splits faces: three rules, one a kind of new vertex."""
+
+    def limit(self, stage: Stage) -> LimitMasks:
+        """Where a scheme interpolates, vertices are on the limit; no masks of tangents are printed for those here."""
+        return LimitMasks(as_masks(identity(stage.n_vertices)), None)
 
     def vertex_masks(self, stage: Stage, sides: Sides) -> Matrix:
         """Weights `[v, v]` of the old vertices in their new places; never asked of a scheme that interpolates."""

@@ -75,7 +75,12 @@ class BezierTriangle(AbstractScheme):
         return PatchLevel(stage.edges, triangles, quads, np.append(row, len(row) + np.arange(n_quads)))
 
     def refine_level(
-        self, h: None, level: PatchLevel, x: Float[Array, "v 3"], n: Float[Array, "v 3"], recompute: bool
+        self,
+        h: Float[Array, ""] | None,
+        level: PatchLevel,
+        x: Float[Array, "v 3"],
+        n: Float[Array, "v 3"],
+        recompute: bool,
     ) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
         parts = [triangle_patch(level.in_triangles, x, n), quad_patch(level.in_quads, x, n)]
         points, normals = (take(jnp.concatenate(rows), level.order) for rows in zip(*parts, strict=True))
@@ -100,7 +105,7 @@ def triangle_patch(at: Places, x: Float[Array, "v 3"], n: Float[Array, "v 3"]) -
     w = 1 - u - v
     p, q = ([take(values, corner) for corner in at.corners.T] for values in (x, n))
     weights = (w, u, v)
-    middle, point, normal = 0.0, 0.0, 0.0
+    middle = point = normal = jnp.zeros_like(p[0])
     for i in range(3):
         j = (i + 1) % 3
         near = p[i] + tangent(p[i], p[j], q[i]) / 3  # b_210 and b_120 and so on
@@ -119,7 +124,8 @@ def quad_patch(at: Places, x: Float[Array, "v 3"], n: Float[Array, "v 3"]) -> tu
     s, t = (1 - u, u), (1 - v, v)  # how near a corner is, by its place along u and along v
     place = ((0, 0), (1, 0), (1, 1), (0, 1))
     middles = [edge_normal(p[i], p[(i + 1) % 4], q[i], q[(i + 1) % 4]) for i in range(4)]
-    point, normal = 0.0, s[0] * s[1] * t[0] * t[1] * unit((middles[0] + middles[1]) + (middles[2] + middles[3]))
+    centre = unit((middles[0] + middles[1]) + (middles[2] + middles[3]))
+    point, normal = jnp.zeros_like(centre), s[0] * s[1] * t[0] * t[1] * centre
     for i, (a, b) in enumerate(place):
         along_u, along_v = (i + 1, i - 1) if i % 2 == 0 else (i - 1, i + 1)
         blend_u, blend_v = s[a] ** 2 * (3 - 2 * s[a]), t[b] ** 2 * (3 - 2 * t[b])

@@ -5,7 +5,7 @@ from typing import ClassVar
 import equinox as eqx
 import numpy as np
 
-from .._masks import Matrix, entries, scaled
+from .._masks import Matrix, Term, entries, scaled
 from .._normals import Weights
 from .._stage import Sides, Stage, ring_positions
 from .base import AbstractPrimalScheme
@@ -49,7 +49,7 @@ class ModifiedButterfly(AbstractPrimalScheme):
 def _eight_point_rule(stage: Stage, sides: Sides) -> Matrix:
     """1/2 for the ends, 1/8 for the corners opposite, -1/16 for the four wings beside those."""
     e = np.arange(len(stage.edges))
-    terms = [(e[:, None], stage.edges, 1 / 2), (sides.edge, sides.start[sides.before], 1 / 8)]
+    terms: list[Term] = [(e[:, None], stage.edges, 1 / 2), (sides.edge, sides.start[sides.before], 1 / 8)]
     for beside in (sides.next, sides.before):
         across = sides.twin[beside]
         wing = np.where(across >= 0, sides.start[sides.before[across]], -1)
@@ -65,7 +65,7 @@ def _ring_rule(stage: Stage, sides: Sides, extraordinary: np.ndarray, valence: n
     """For every edge the sum over its extraordinary ends: 3/4 of the end, and the weights of its ring."""
     e, n = np.arange(len(stage.edges)), stage.n_vertices
     position = ring_positions(sides)
-    terms = [(e[:, None], stage.edges, np.where(extraordinary[stage.edges], 3 / 4, 0.0))]
+    terms: list[Term] = [(e[:, None], stage.edges, np.where(extraordinary[stage.edges], 3 / 4, 0.0))]
     # Sides that leave each vertex, in order: rows of a table by valence.
     for k in np.unique(valence[extraordinary]):
         out = np.flatnonzero(extraordinary[sides.start] & (valence[sides.start] == k))

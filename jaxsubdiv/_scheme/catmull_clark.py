@@ -4,11 +4,11 @@ from typing import ClassVar
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .._masks import Matrix, entries, scaled
 from .._stage import Sides, Stage, quad_split
-from .creased import AbstractCreasedScheme, Edge, border
+from .creased import AbstractCreasedScheme, Edge, across_border, border
 
 
 class CatmullClark(AbstractCreasedScheme):
@@ -22,7 +22,7 @@ class CatmullClark(AbstractCreasedScheme):
         ValueError: `boundary` is not one of these.
 
     Source: E. Catmull & J. Clark, Recursively generated B-spline surfaces on arbitrary topological meshes, 1978. Limit
-    masks: Halstead, Kass & DeRose 1993; on boundaries Biermann, Levin & Zorin 2000. Creases as in OpenSubdiv.
+    masks: Halstead, Kass & DeRose 1993. Creases as in OpenSubdiv.
     """
 
     boundary: Edge = eqx.field(static=True, default="edge-and-corner")
@@ -59,45 +59,38 @@ class CatmullClark(AbstractCreasedScheme):
         to_edges = entries((n, edges.shape[0]), (sides.start, sides.edge, 4.0))
         return scaled(1 / (k * (k + 5)), scaled(k**2, vertices) + to_edges @ edges + to_faces @ centres)
 
-    def limit_tangents(self, stage: Stage, sides: Sides, position: np.ndarray) -> tuple[Matrix, Matrix]:
+    def limit_tangents(self, stage: Stage, sides: Sides, position: Int[np.ndarray, "s"]) -> tuple[Matrix, Matrix]:
         # Of the quads that the next level has, for the reason given above.
         centres, edges, vertices = (
             rule(stage, sides) for rule in (self.face_masks, self.edge_masks, self.vertex_masks)
         )
-        n, k = stage.n_vertices, _valence(stage, sides)
-        edge = border(stage, sides).next[sides.start] >= 0
-        theta = np.where(edge, np.pi, 2 * np.pi) / k[sides.start]
-        here, ahead = position * theta, (position + 1) * theta
-        c = np.cos(theta)
+        n, v, k = stage.n_vertices, np.arange(stage.n_vertices), _valence(stage, sides)
+        after = border(stage, sides).next
+        on_border, outer = after[sides.start] >= 0, sides.twin < 0
+        # Inside: the first Fourier mode of the ring. On a boundary: along it, and across it.
+        theta = np.where(after >= 0, np.pi, 2 * np.pi) / k
+        c, total = np.cos(theta), 1 / np.tan(theta / 2)  # the sum of sin(i theta), i = 1 to k - 1
         eigenvalue = 5 / 16 + (c + np.cos(theta / 2) * np.sqrt(2 * (9 + c))) / 16
-        of_face = np.where(edge, 1.0, 1 / (4 * eigenvalue - 1))
-        outer = sides.twin < 0  # the boundary edge that leaves a vertex; the one that comes in is this side's other end
-        v = np.arange(n)
-        cosine, sine = np.where(edge, 0.0, 1.0) * np.cos(here), np.sin(here)
-        pairs = []
-        for wave, next_wave, along in ((cosine, np.where(edge, 0.0, np.cos(ahead)), 1.0), (sine, np.sin(ahead), None)):
-            r = 1 / np.tan(np.pi / (2 * k))
-            at_border = np.where(k == 1, 3.0, -r * (1 + 2 * np.cos(np.pi / k)))
-            edge_terms = [(sides.start, sides.edge, 4 * wave)]
-            if along is not None:
-                edge_terms += [
-                    (sides.start[outer], sides.edge[outer], along),
-                    (sides.end[outer], sides.edge[outer], -along),
-                ]
-                of_vertex = np.zeros(n)
-            else:
-                edge_terms += [
-                    (sides.start[outer], sides.edge[outer], at_border[sides.start[outer]]),
-                    (sides.end[outer], sides.edge[outer], at_border[sides.end[outer]]),
-                ]
-                of_vertex = np.where(k == 1, -6.0, 4 * r * (np.cos(np.pi / k) - 1))
-                of_vertex[np.setdiff1d(v, sides.start[outer])] = 0
-            pairs.append(
-                entries((n, edges.shape[0]), *edge_terms) @ edges
-                + entries((n, centres.shape[0]), (sides.start, sides.face, of_face * (wave + next_wave))) @ centres
+        eigenvalue = np.where(k == 1, 1 / 2, eigenvalue)  # of no meaning there: a single face has no inner edges
+        face = np.where(k == 1, 0.0, 1 / (16 * eigenvalue - 4))
+        itself, neighbour = across_border(
+            k, eigenvalue, (1 / 16 + face / 4) * np.sin(theta), (3 / 8 + face / 2) * total
+        )
+        here, ahead = position * theta[sides.start], (position + 1) * theta[sides.start]
+        start, end, edge = sides.start[outer], sides.end[outer], sides.edge[outer]
+        tangents = []
+        for wave, next_wave, of_vertex, of_start, of_end in (
+            (np.where(on_border, 0.0, np.cos(here)), np.where(on_border, 0.0, np.cos(ahead)), 0.0, 1.0, -1.0),
+            (np.sin(here), np.sin(ahead), np.where(after < 0, 0.0, itself), neighbour[start], neighbour[end]),
+        ):
+            of_edges = [(sides.start, sides.edge, wave), (start, edge, of_start), (end, edge, of_end)]
+            of_faces = (sides.start, sides.face, face[sides.start] * (wave + next_wave))
+            tangents.append(
+                entries((n, edges.shape[0]), *of_edges) @ edges
+                + entries((n, centres.shape[0]), of_faces) @ centres
                 + entries((n, n), (v, v, of_vertex)) @ vertices
             )
-        return pairs[0], pairs[1]
+        return tangents[0], tangents[1]
 
 
 def _valence(stage: Stage, sides: Sides) -> Float[np.ndarray, "v"]:

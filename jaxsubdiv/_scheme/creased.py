@@ -5,9 +5,9 @@ from typing import ClassVar, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from .._masks import Matrix, as_masks, entries, identity, scaled
+from .._masks import Matrix, Term, as_masks, entries, identity, scaled
 from .._normals import Weights
 from .._stage import INFINITE, Sides, Stage, after_one_level, ring_positions, sides_of
 from .._topology import LimitMasks
@@ -27,7 +27,7 @@ class Sharpness(NamedTuple):
         """What is left of it at the next level."""
         return Sharpness(after_one_level(self.edge), after_one_level(self.vertex))
 
-    def rule(self, stage: Stage) -> np.ndarray:
+    def rule(self, stage: Stage) -> Int[np.ndarray, "v"]:
         """For every vertex 0 (smooth, or the end of one sharp edge), 1 (a crease) or 2 (a corner)."""
         sharp = stage.edges[self.edge > 0]
         n_sharp = np.bincount(sharp.ravel(), minlength=stage.n_vertices)
@@ -68,7 +68,7 @@ def blended_vertices(stage: Stage, now: Sharpness, smooth: Matrix) -> Matrix:
     n = stage.n_vertices
     along = np.where(next_rule[:, None] == 1, [[True, False]], [[False, True]])  # later, now
     v = np.arange(n)
-    terms = [(v, v, 0.75)]
+    terms: list[Term] = [(v, v, 0.75)]
     for i, sharp in enumerate((later.edge > 0, now.edge > 0)):
         for start, end in ((a, b), (b, a)):
             terms.append((start[sharp], end[sharp], np.where(along[start[sharp], i], 0.125, 0.0)))
@@ -138,18 +138,40 @@ class AbstractCreasedScheme(AbstractPrimalScheme):
 
 
 class Border(NamedTuple):
-    """The boundary vertices of a level, and where their tangents come from."""
+    """Neighbours along the boundary."""
 
-    next: np.ndarray
+    next: Int[np.ndarray, "v"]
     """For every vertex the far end of the boundary edge that leaves it, or -1."""
-    previous: np.ndarray
+    previous: Int[np.ndarray, "v"]
     """The far end of the one that comes in, or -1."""
 
 
 def border(stage: Stage, sides: Sides) -> Border:
-    """Neighbours along the boundary."""
+    """Neighbours of every vertex along the boundary."""
     ends = np.full((2, stage.n_vertices), -1)
     outer = sides.twin < 0
     ends[0, sides.start[outer]] = sides.end[outer]
     ends[1, sides.end[outer]] = sides.start[outer]
     return Border(*ends)
+
+
+def across_border(
+    k: Float[np.ndarray, "v"],
+    eigenvalue: Float[np.ndarray, "v"],
+    beside: Float[np.ndarray, "v"],
+    inside: Float[np.ndarray, "v"],
+) -> tuple[Float[np.ndarray, "v"], Float[np.ndarray, "v"]]:
+    """Weights of a boundary vertex and of its two boundary neighbours in the tangent across the boundary.
+
+    The tangent is the left eigenvector of the ring's own subdivision, in which the inner edges i = 1 to k - 1 weigh
+    sin(i pi/k). With (3/4, 1/8, 1/8) at the vertex and (1/2, 1/2) beside it two equations are left for its weights.
+
+    Args:
+        k: number of faces.
+        eigenvalue: of the inner edges.
+        beside: what the inner edges' and faces' rules give of a boundary neighbour.
+        inside: what they give of the vertex itself.
+    """
+    itself = (beside + (eigenvalue - 1 / 2) * inside) / ((eigenvalue - 1) * (eigenvalue - 1 / 4))
+    neighbour = (eigenvalue - 3 / 4) * itself - inside
+    return np.where(k == 1, -2.0, itself), np.where(k == 1, 1.0, neighbour)

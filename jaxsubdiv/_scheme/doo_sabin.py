@@ -5,7 +5,7 @@ from typing import ClassVar
 import equinox as eqx
 import numpy as np
 
-from .._masks import Matrix, as_masks, entries, stack
+from .._masks import Matrix, Term, as_masks, entries, stack
 from .._normals import Weights
 from .._stage import Stage, dual_split, ring_positions, sides_of
 from .._topology import LimitMasks
@@ -28,12 +28,14 @@ class DooSabin(AbstractLinearScheme):
     weights: Weights = eqx.field(static=True, default="area", init=False)
 
     interpolates: ClassVar[bool] = False
+    is_primal: ClassVar[bool] = False
     order: ClassVar[int] = 2
 
     def masks(self, stage: Stage) -> Matrix:
         """A vertex a corner of every face, in the order of the sides, then two a boundary edge."""
         sides, n = sides_of(stage), stage.n_vertices
-        terms, first = [], 0
+        terms: list[Term] = []
+        first = 0
         for k, faces in sorted(stage.faces.items()):
             corner = first + np.arange(faces.size).reshape(-1, k)
             first += faces.size

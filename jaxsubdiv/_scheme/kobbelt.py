@@ -5,7 +5,7 @@ from typing import ClassVar
 import equinox as eqx
 import numpy as np
 
-from .._masks import Matrix, entries, scaled
+from .._masks import Matrix, Term, entries, scaled
 from .._normals import Weights
 from .._stage import Sides, Stage, ring_positions
 from .base import AbstractPrimalScheme
@@ -74,7 +74,7 @@ def _beyond(stage: Stage, sides: Sides) -> Matrix:
     on_border = border(stage, sides).next >= 0
     valence = np.bincount(sides.start, minlength=n)
     mirrored = on_border[sides.start]
-    terms = [(side[mirrored], sides.start[mirrored], 2.0), (side[mirrored], sides.end[mirrored], -1.0)]
+    terms: list[Term] = [(side[mirrored], sides.start[mirrored], 2.0), (side[mirrored], sides.end[mirrored], -1.0)]
     position = ring_positions(sides)
     for k in np.unique(valence[sides.start[~mirrored]]):
         out = np.flatnonzero(~mirrored & (valence[sides.start] == k))

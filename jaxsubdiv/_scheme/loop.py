@@ -4,12 +4,12 @@ from typing import ClassVar, Literal, TypeAlias, get_args
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .._masks import Matrix, entries
 from .._stage import Sides, Stage
 from .base import check_option
-from .creased import AbstractCreasedScheme, Edge, border
+from .creased import AbstractCreasedScheme, Edge, across_border, border
 
 Variant: TypeAlias = Literal["loop", "warren"]
 
@@ -27,7 +27,7 @@ class Loop(AbstractCreasedScheme):
         ValueError: an option is not one of these.
 
     Source: C. Loop, Smooth subdivision surfaces based on triangles, 1987; J. Warren, Subdivision methods for geometric
-    design, 1995. Creases as in OpenSubdiv, which has the weights of 1987; limit tangents: Biermann, Levin & Zorin 2000.
+    design, 1995. Creases as in OpenSubdiv, which has the weights of 1987.
     """
 
     variant: Variant = eqx.field(static=True, default="loop")
@@ -62,30 +62,27 @@ class Loop(AbstractCreasedScheme):
         v = np.arange(len(k))
         return entries((len(k), len(k)), (v, v, 1 - k * share), (sides.start, sides.end, share[sides.start]))
 
-    def limit_tangents(self, stage: Stage, sides: Sides, position: np.ndarray) -> tuple[Matrix, Matrix]:
-        n = stage.n_vertices
-        k = np.bincount(sides.start, minlength=n)[sides.start]
+    def limit_tangents(self, stage: Stage, sides: Sides, position: Int[np.ndarray, "s"]) -> tuple[Matrix, Matrix]:
+        n, v = stage.n_vertices, np.arange(stage.n_vertices)
+        k = np.maximum(np.bincount(sides.start, minlength=n), 1).astype(float)
         after, before = border(stage, sides)
-        edge = after[sides.start] >= 0
-        angle = np.where(edge, np.pi * position / k, 2 * np.pi * position / k)
-        v = np.arange(n)
-        n_faces = np.maximum(np.bincount(sides.start, minlength=n), 1)
-        theta = np.pi / n_faces
+        on_border = after[sides.start] >= 0
         # Inside: the first Fourier mode of the ring. On a boundary: along it, and across it.
-        first = entries(
-            (n, n), (sides.start, sides.end, np.where(edge, 0.0, np.cos(angle))), (v, after, 1.0), (v, before, -1.0)
-        )
-        inner = edge & (position > 0)
-        across = np.where(inner, 2 * (1 - np.cos(theta[sides.start])) * np.sin(angle), 0.0)
-        few = n_faces[sides.start] <= 2  # two triangles or one: the formula leaves the vertex itself out
-        across = np.where(few, 1.0 * inner, across)
-        at_end = np.where(n_faces == 1, 1.0, np.where(n_faces == 2, 0.0, -np.sin(theta)))
-        itself = np.where(after < 0, 0.0, np.where(n_faces == 1, -2.0, np.where(n_faces == 2, -1.0, 0.0)))
-        second = entries(
+        angle = np.where(on_border, np.pi, 2 * np.pi) * position / k[sides.start]
+        theta = np.pi / k
+        total = 1 / np.tan(theta / 2)  # of sin(i theta), i = 1 to k - 1
+        itself, neighbour = across_border(k, 3 / 8 + np.cos(theta) / 4, np.sin(theta) / 8, 3 / 8 * total)
+        along = entries(
             (n, n),
-            (sides.start, sides.end, np.where(edge, across, np.sin(angle))),
-            (v, after, at_end),
-            (v, before, at_end),
-            (v, v, itself),
+            (sides.start, sides.end, np.where(on_border, 0.0, np.cos(angle))),
+            (v, after, 1.0),
+            (v, before, -1.0),
         )
-        return first, second
+        across = entries(
+            (n, n),
+            (sides.start, sides.end, np.sin(angle)),
+            (v, after, neighbour),
+            (v, before, neighbour),
+            (v, v, np.where(after < 0, 0.0, itself)),
+        )
+        return along, across
