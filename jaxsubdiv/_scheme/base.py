@@ -183,7 +183,8 @@ class AbstractLinearScheme(AbstractScheme):
         recompute: bool,
     ) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
         new = level.masks(x)
-        return (jnp.concatenate([x, new]) if self.interpolates else new), n
+        refined = jnp.concatenate([x, new]) if self.interpolates else new
+        return refined, jnp.zeros_like(refined)  # `refine` puts in those of the last mesh
 
 
 class AbstractPrimalScheme(AbstractLinearScheme):

@@ -99,43 +99,44 @@ def edge_normal(x_a: Rows, x_b: Rows, n_a: Rows, n_b: Rows) -> Rows:
     return unit(s - 2 * dot(along, s) * along)
 
 
+def corner_values(at: Places, x: Float[Array, "v 3"]) -> tuple[Float[Array, "k m 3"], Float[Array, "k m 3"]]:
+    """Values at the corners of every face, and at the corners after those."""
+    here = take(x, at.corners.T)
+    return here, jnp.roll(here, -1, axis=0)
+
+
 def triangle_patch(at: Places, x: Float[Array, "v 3"], n: Float[Array, "v 3"]) -> tuple[Rows, Rows]:
     """Points and normals of PN triangles."""
     u, v = at.coordinates(x)
-    w = 1 - u - v
-    p, q = ([take(values, corner) for corner in at.corners.T] for values in (x, n))
-    weights = (w, u, v)
-    middle = point = normal = jnp.zeros_like(p[0])
-    for i in range(3):
-        j = (i + 1) % 3
-        near = p[i] + tangent(p[i], p[j], q[i]) / 3  # b_210 and b_120 and so on
-        far = p[j] + tangent(p[j], p[i], q[j]) / 3
-        middle += (near + far) / 6
-        point += weights[i] ** 3 * p[i] + 3 * weights[i] * weights[j] * (weights[i] * near + weights[j] * far)
-        normal += weights[i] ** 2 * q[i] + weights[i] * weights[j] * edge_normal(p[i], p[j], q[i], q[j])
-    flat = (p[0] + p[1] + p[2]) / 3
-    return point + 6 * u * v * w * (1.5 * middle - 0.5 * flat), unit(normal)
+    (p, p_next), (q, q_next) = corner_values(at, x), corner_values(at, n)
+    weight = jnp.stack([1 - u - v, u, v])
+    after = jnp.roll(weight, -1, axis=0)
+    near = p + tangent(p, p_next, q) / 3  # b_210, b_021, b_102
+    far = p_next + tangent(p_next, p, q_next) / 3  # b_120, b_012, b_201
+    point = (weight**3 * p + 3 * weight * after * (weight * near + after * far)).sum(axis=0)
+    normal = (weight**2 * q + weight * after * edge_normal(p, p_next, q, q_next)).sum(axis=0)
+    middle = (near + far).sum(axis=0) / 4 - p.sum(axis=0) / 6  # b_111 = E + (E - V) / 2
+    return point + 6 * weight[0] * weight[1] * weight[2] * middle, unit(normal)
 
 
 def quad_patch(at: Places, x: Float[Array, "v 3"], n: Float[Array, "v 3"]) -> tuple[Rows, Rows]:
     """Points of bicubic Hermite patches with zero twist, and biquadratic normals."""
     u, v = at.coordinates(x)
-    p, q = ([take(values, corner) for corner in at.corners.T] for values in (x, n))
-    s, t = (1 - u, u), (1 - v, v)  # how near a corner is, by its place along u and along v
-    place = ((0, 0), (1, 0), (1, 1), (0, 1))
-    middles = [edge_normal(p[i], p[(i + 1) % 4], q[i], q[(i + 1) % 4]) for i in range(4)]
-    centre = unit((middles[0] + middles[1]) + (middles[2] + middles[3]))
-    point, normal = jnp.zeros_like(centre), s[0] * s[1] * t[0] * t[1] * centre
-    for i, (a, b) in enumerate(place):
-        along_u, along_v = (i + 1, i - 1) if i % 2 == 0 else (i - 1, i + 1)
-        blend_u, blend_v = s[a] ** 2 * (3 - 2 * s[a]), t[b] ** 2 * (3 - 2 * t[b])
-        point += blend_u * blend_v * p[i]
-        point += s[a] ** 2 * (1 - s[a]) * blend_v * tangent(p[i], p[along_u % 4], q[i])
-        point += blend_u * t[b] ** 2 * (1 - t[b]) * tangent(p[i], p[along_v % 4], q[i])
-        normal += s[a] ** 2 * t[b] ** 2 * q[i]
-        of_edge = s[0] * s[1] * t[b] ** 2 if i % 2 == 0 else s[a] ** 2 * t[0] * t[1]
-        normal += of_edge * middles[i]
-    return point, unit(normal)
+    (p, p_next), (q, q_next) = corner_values(at, x), corner_values(at, n)
+    # How near a point is to each corner, along the side that follows the corner and along the one before it.
+    ahead, back = jnp.stack([1 - u, 1 - v, u, v]), jnp.stack([1 - v, u, v, 1 - u])
+    of_tangent_ahead, of_tangent_back = ahead**2 * (1 - ahead), back**2 * (1 - back)
+    blend_ahead, blend_back = ahead**2 * (3 - 2 * ahead), back**2 * (3 - 2 * back)
+    p_before = jnp.roll(p, 1, axis=0)
+    point = (
+        blend_ahead * blend_back * p
+        + of_tangent_ahead * blend_back * tangent(p, p_next, q)
+        + blend_ahead * of_tangent_back * tangent(p, p_before, q)
+    ).sum(axis=0)
+    middles = edge_normal(p, p_next, q, q_next)
+    normal = ((ahead * back) ** 2 * q + ahead * (1 - ahead) * back**2 * middles).sum(axis=0)
+    inside = u * (1 - u) * v * (1 - v)
+    return point, unit(normal + inside * unit(middles.sum(axis=0)))
 
 
 def _places(stage: Stage, size: int, face: Int[np.ndarray, "m"], side: Int[np.ndarray, "m"]) -> Places:

@@ -1,5 +1,6 @@
 """The modified butterfly scheme for triangles."""
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -71,24 +72,33 @@ def _ring_rule(stage: Stage, sides: Sides, extraordinary: np.ndarray, valence: n
         out = np.flatnonzero(extraordinary[sides.start] & (valence[sides.start] == k))
         out = out[np.lexsort((position[out], sides.start[out]))].reshape(-1, k)
         neighbours = sides.end[out]
-        for j in range(k):
-            terms.append((sides.edge[out], np.roll(neighbours, -j, axis=1), _ring_weight(k, j)))
+        for j, weight in enumerate(_ring_weights(int(k))):
+            terms.append((sides.edge[out], np.roll(neighbours, -j, axis=1), weight))
     return entries((len(e), n), *terms)
 
 
-def _ring_weight(k: int, j: int) -> float:
-    """Weight of the neighbour that lies `j` places after the edge itself."""
+def _ring_weights(k: int) -> Sequence[float]:
+    """Weights of the neighbours of a vertex of valence `k`, from that along the edge itself on."""
     if k == 3:
-        return (5 / 12, -1 / 12, -1 / 12)[j]
+        return (5 / 12, -1 / 12, -1 / 12)
     if k == 4:
-        return (3 / 8, 0.0, -1 / 8, 0.0)[j]
-    return (1 / 4 + np.cos(2 * np.pi * j / k) + np.cos(4 * np.pi * j / k) / 2) / k
+        return (3 / 8, 0.0, -1 / 8, 0.0)
+    angle = 2 * np.pi * np.arange(k) / k
+    return ((1 / 4 + np.cos(angle) + np.cos(2 * angle) / 2) / k).tolist()
 
 
 def four_point_boundary(stage: Stage, sides: Sides) -> Matrix:
     """The four-point rule along the boundary: 9/16 for the ends, -1/16 for the vertices beside them; 0 elsewhere."""
-    after, before = border(stage, sides)
     e = np.flatnonzero(stage.right < 0)
-    a, b = stage.edges[e].T  # each runs the way of the boundary
+    a, b = stage.edges[e].T  # each runs the way of the boundary, as its only side does
+    # Where two fans of faces share a vertex, the boundary of each stays with its fan.
+    side = stage.left[e]
+    follows = sides.next[side]
+    while (turning := sides.twin[follows] >= 0).any():
+        follows = np.where(turning, sides.next[sides.twin[follows]], follows)
+    leads = np.empty_like(side)
+    row = np.searchsorted(side, follows, sorter=(order := np.argsort(side)))
+    leads[order[row]] = side
     rows = (len(stage.edges), stage.n_vertices)
-    return entries(rows, (e, a, 9 / 16), (e, b, 9 / 16), (e, before[a], -1 / 16), (e, after[b], -1 / 16))
+    beside = [(e, sides.start[leads], -1 / 16), (e, sides.end[follows], -1 / 16)]
+    return entries(rows, (e, a, 9 / 16), (e, b, 9 / 16), *beside)
