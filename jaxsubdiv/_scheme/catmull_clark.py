@@ -60,9 +60,11 @@ class CatmullClark(AbstractCreasedScheme):
         return scaled(1 / (k * (k + 5)), scaled(k**2, vertices) + to_edges @ edges + to_faces @ centres)
 
     def limit_tangents(self, stage: Stage, sides: Sides, position: Int[np.ndarray, "s"]) -> tuple[Matrix, Matrix]:
-        # Of the quads that the next level has, for the reason given above.
+        # Of the quads that the next level has, for the reason given above. A vertex at the end of a single sharp edge
+        # is taken for smooth, as in OpenSubdiv.
+        smooth = stage._replace(edge_sharpness=None, vertex_sharpness=None)
         centres, edges, vertices = (
-            rule(stage, sides) for rule in (self.face_masks, self.edge_masks, self.vertex_masks)
+            rule(smooth, sides) for rule in (self.face_masks, self.edge_masks, self.vertex_masks)
         )
         n, v, k = stage.n_vertices, np.arange(stage.n_vertices), _valence(stage, sides)
         after = border(stage, sides).next
