@@ -2,8 +2,11 @@
 
 from importlib.metadata import version as _version
 
+from ._admissible import admissible_margin as admissible_margin
 from ._control import Control as Control
 from ._creases import Creases as Creases
+from ._curvature import Curvatures as Curvatures
+from ._curvature import curvatures as curvatures
 from ._errors import MeshError as MeshError
 from ._io import PointCloud as PointCloud
 from ._io import read_mesh as read_mesh

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Int
 
+from ._admissible import warn_of_folds
 from ._creases import Creases, sharpened
 from ._errors import MeshError
 from ._fans import Fans, as_table, group_corners, mesh_fans
@@ -137,10 +138,16 @@ def build_topology(
             scheme knows no creases or no limit masks.
         MeshError: the mesh was made with `check=False` and does not pass, the scheme does not take faces of this kind,
             or a crease is not an edge of the mesh.
+
+    Warns:
+        UserWarning: a normal that the mesh was given is not admissible, and the scheme keeps it; see
+            `admissible_margin`.
     """
     mesh.check()
     _check_faces(mesh, scheme)
     levels = _checked_levels(mesh, levels)
+    if mesh.normals is not None and scheme.uses_normals and not scheme.recomputes_normals:
+        warn_of_folds(mesh)
     stage = stage_of(len(mesh.vertices), mesh.faces, mesh.half_edges)
     if creases is not None:
         if not scheme.takes_creases:

@@ -143,7 +143,6 @@ def _places(stage: Stage, size: int, face: Int[np.ndarray, "m"], side: Int[np.nd
     """The middles of sides of faces, and with side -1 the middles of quads."""
     uv, n_children = _corner_uv(size, stage.level), 4**stage.level
     control, child = np.divmod(face, n_children)
-    # A face's first descendant starts at its first corner, and so on: corner children keep their corner.
     blocks = stage.faces[size].reshape(-1, n_children, size)
     ahead = np.where(side < 0, 2, (side + 1) % size)
     behind = np.where(side < 0, 0, side)
@@ -152,10 +151,10 @@ def _places(stage: Stage, size: int, face: Int[np.ndarray, "m"], side: Int[np.nd
 
 
 def _control_corners(blocks: Int[np.ndarray, "f n k"], size: int, level: int) -> Int[np.ndarray, "f k"]:
-    """Corners of the control faces: child `c` of a face starts at its corner `c`, at every level."""
-    rows = [sum(corner * 4**power for power in range(level)) for corner in range(size)]
-    first = [0 if level else corner for corner in range(size)]
-    return blocks[:, rows if level else [0] * size, first]
+    """Corners of the control faces: at corner `c` lies child `c`, which starts there, and so do its first children."""
+    if level == 0:
+        return blocks[:, 0]
+    return blocks[:, 4 ** (level - 1) * np.arange(size), 0]
 
 
 def _corner_uv(size: int, level: int) -> Int[np.ndarray, "n k 2"]:
