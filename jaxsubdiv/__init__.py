@@ -8,6 +8,8 @@ from ._creases import Creases as Creases
 from ._curvature import Curvatures as Curvatures
 from ._curvature import curvatures as curvatures
 from ._errors import MeshError as MeshError
+from ._evaluate import SurfaceJet as SurfaceJet
+from ._evaluate import evaluate_control as evaluate_control
 from ._io import PointCloud as PointCloud
 from ._io import read_mesh as read_mesh
 from ._io import read_points as read_points

@@ -1,12 +1,17 @@
 """Semi-sharp creases of a control mesh, for the schemes that know them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ._errors import MeshError, name_rows
 from ._stage import INFINITE, Stage
+
+Numbers: TypeAlias = ArrayLike | Sequence[Any] | float | int
+"""What numpy makes an array of; the checks of annotations in the tests take no plain `ArrayLike` for that."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +31,10 @@ class Creases:
     it (Sdc, creasing method "uniform").
     """
 
-    edges: ArrayLike = ()
-    sharpness: ArrayLike = INFINITE
-    vertices: ArrayLike = ()
-    vertex_sharpness: ArrayLike = INFINITE
+    edges: Numbers = ()
+    sharpness: Numbers = INFINITE
+    vertices: Numbers = ()
+    vertex_sharpness: Numbers = INFINITE
 
 
 def sharpened(stage: Stage, creases: Creases) -> Stage:
@@ -56,7 +61,7 @@ def sharpened(stage: Stage, creases: Creases) -> Stage:
     return stage._replace(edge_sharpness=edge_sharpness, vertex_sharpness=vertex_sharpness)
 
 
-def _values(name: str, values: ArrayLike, n: int) -> np.ndarray:
+def _values(name: str, values: Numbers, n: int) -> np.ndarray:
     rows = np.asarray(values, np.float64)
     if rows.ndim > 1 or (rows.ndim == 1 and len(rows) != n):
         raise MeshError(f"`{name}` must be one number or {n}, one each; got shape {list(rows.shape)}.")
