@@ -1,4 +1,4 @@
-"""Differentiable interpolating subdivision surfaces of triangles and quads, in JAX."""
+"""Differentiable subdivision surfaces of triangles and quads, in JAX."""
 
 from importlib.metadata import version as _version
 

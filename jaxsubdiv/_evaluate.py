@@ -71,8 +71,9 @@ def _evaluate(scheme: AbstractScheme, topology: Topology, control: Control, at: 
         surface = refine(scheme, topology, control)
         x, n, faces, levels = surface.vertices, surface.normals, surface.faces, len(topology.levels)
     n_triangles = topology.control_faces[3].shape[0]
-    in_triangle = at.face < n_triangles
-    row, uv = jnp.where(in_triangle, at.face, at.face - n_triangles), at.uv.astype(x.dtype)
+    given, uv = at.face.astype(jnp.int32), at.uv.astype(x.dtype)
+    in_triangle = given < n_triangles
+    row = jnp.where(in_triangle, given, given - n_triangles)
 
     def patches(uv: Float[Array, "p 2"]) -> tuple[Float[Array, "p 3"], Float[Array, "p"]]:
         found = []

@@ -431,7 +431,7 @@ def test_curvatures_are_exact_and_differentiable_on_a_sphere():
     for radius in (0.5, 3.0):
         np.testing.assert_allclose(mean(jnp.asarray(radius), jnp.asarray(vertices)), 1 / radius, rtol=1e-12)
         # Every point is umbilic: the roots' derivative is that of the mean.
-        slope = jax.jacrev(mean)(jnp.asarray(radius), jnp.asarray(vertices))
+        slope = jax.jit(jax.jacfwd(mean))(jnp.asarray(radius), jnp.asarray(vertices))
         np.testing.assert_allclose(slope, -1 / radius**2, rtol=1e-10)
     rng, step = np.random.default_rng(0), 1e-6
     surface, _ = of_torus(4, "quad")
@@ -441,7 +441,7 @@ def test_curvatures_are_exact_and_differentiable_on_a_sphere():
         bent = js.RefinedSurface(surface.vertices + t * along, surface.normals, surface.faces)
         return sum(jnp.sum(jnp.sin(part)) for part in js.curvatures(bent))
 
-    slope = jax.grad(total)(0.0)
+    slope = jax.jit(jax.grad(total))(0.0)
     np.testing.assert_allclose(slope, (total(step) - total(-step)) / (2 * step), rtol=1e-6)
 
 
@@ -459,24 +459,25 @@ PLACES = np.random.default_rng(2).dirichlet(np.ones(3), 40)[:, :2]
 @pytest.mark.parametrize("name", ["default", "bezier-triangle", "loop"])
 def test_places_in_control_faces_are_where_their_refined_faces_are(name):
     case = by_name(name)
-    mesh = control_mesh(meshes.pyramid()) if 4 in case.scheme.takes else control_mesh(meshes.octahedron())
+    mesh = control_mesh(meshes.mixed_closed() if 4 in case.scheme.takes else meshes.octahedron())
     scheme, control, levels = case.with_h(1.0), mesh.control(), 2
     options = {"limit": True} if scheme.is_linear else {}
-    coarse, fine = (js.build_topology(mesh, scheme, n, **options) for n in (levels, 5))
+    coarse, fine = (js.build_topology(mesh, scheme, n, **options) for n in (levels, 4))
     face = np.arange(len(PLACES)) % mesh.n_faces
     uv = jnp.asarray(PLACES)
     jet = js.evaluate_control(scheme, coarse, control, js.SurfacePoint(face, uv))
     # Against the flat faces of a finer surface, and against differences of itself.
-    dense = np.asarray(js.refine(scheme, fine, control).vertices)
-    assert KDTree(dense).query(jet.points)[0].max() < 0.06
+    dense = js.refine(scheme, fine, control)
+    corners = np.asarray(dense.vertices)[np.asarray(dense.triangles())]
+    assert closest_on_mesh(np.asarray(jet.points), corners)[0].max() < 5e-3
     closer = js.evaluate_control(scheme, fine, control, js.SurfacePoint(face, uv))
     gap = np.linalg.norm(jet.points - closer.points, axis=1)
     assert np.all(gap <= jet.error + 1e-12)
     assert name != "bezier-triangle" or not np.any(jet.error)
-    assert name == "bezier-triangle" or np.all(closer.error < jet.error / 8)
+    assert name == "bezier-triangle" or closer.error.mean() < jet.error.mean() / 8
     for slope, step in ((jet.du, (1e-6, 0)), (jet.dv, (0, 1e-6))):
         ahead, back = (
-            js.evaluate_control(scheme, coarse, control, js.SurfacePoint(face, uv + sign * jnp.asarray(step))).points
+            js.evaluate_control(scheme, coarse, control, js.SurfacePoint(face, uv + sign * jnp.asarray([step]))).points
             for sign in (1, -1)
         )
         np.testing.assert_allclose(slope, (ahead - back) / 2e-6, rtol=0, atol=1e-7)

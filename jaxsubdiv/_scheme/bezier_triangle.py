@@ -82,7 +82,11 @@ class BezierTriangle(AbstractScheme):
         n: Float[Array, "v 3"],
         recompute: bool,
     ) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
-        parts = [triangle_patch(level.in_triangles, x, n), quad_patch(level.in_quads, x, n)]
+        triangles, quads = level.in_triangles, level.in_quads
+        parts = [
+            triangle_patch(triangles.corners, *triangles.coordinates(x), x, n),
+            quad_patch(quads.corners, *quads.coordinates(x), x, n),
+        ]
         points, normals = (take(jnp.concatenate(rows), level.order) for rows in zip(*parts, strict=True))
         return jnp.concatenate([x, points]), jnp.concatenate([n, normals])
 
@@ -99,16 +103,23 @@ def edge_normal(x_a: Rows, x_b: Rows, n_a: Rows, n_b: Rows) -> Rows:
     return unit(s - 2 * dot(along, s) * along)
 
 
-def corner_values(at: Places, x: Float[Array, "v 3"]) -> tuple[Float[Array, "k m 3"], Float[Array, "k m 3"]]:
+def corner_values(
+    corners: Int[Array, "m k"], x: Float[Array, "v 3"]
+) -> tuple[Float[Array, "k m 3"], Float[Array, "k m 3"]]:
     """Values at the corners of every face, and at the corners after those."""
-    here = take(x, at.corners.T)
+    here = take(x, corners.T)
     return here, jnp.roll(here, -1, axis=0)
 
 
-def triangle_patch(at: Places, x: Float[Array, "v 3"], n: Float[Array, "v 3"]) -> tuple[Rows, Rows]:
+def triangle_patch(
+    corners: Int[Array, "m 3"],
+    u: Float[Array, "m 1"],
+    v: Float[Array, "m 1"],
+    x: Float[Array, "v 3"],
+    n: Float[Array, "v 3"],
+) -> tuple[Rows, Rows]:
     """Points and normals of PN triangles."""
-    u, v = at.coordinates(x)
-    (p, p_next), (q, q_next) = corner_values(at, x), corner_values(at, n)
+    (p, p_next), (q, q_next) = corner_values(corners, x), corner_values(corners, n)
     weight = jnp.stack([1 - u - v, u, v])
     after = jnp.roll(weight, -1, axis=0)
     near = p + tangent(p, p_next, q) / 3  # b_210, b_021, b_102
@@ -119,10 +130,15 @@ def triangle_patch(at: Places, x: Float[Array, "v 3"], n: Float[Array, "v 3"]) -
     return point + 6 * weight[0] * weight[1] * weight[2] * middle, unit(normal)
 
 
-def quad_patch(at: Places, x: Float[Array, "v 3"], n: Float[Array, "v 3"]) -> tuple[Rows, Rows]:
+def quad_patch(
+    corners: Int[Array, "m 4"],
+    u: Float[Array, "m 1"],
+    v: Float[Array, "m 1"],
+    x: Float[Array, "v 3"],
+    n: Float[Array, "v 3"],
+) -> tuple[Rows, Rows]:
     """Points of bicubic Hermite patches with zero twist, and biquadratic normals."""
-    u, v = at.coordinates(x)
-    (p, p_next), (q, q_next) = corner_values(at, x), corner_values(at, n)
+    (p, p_next), (q, q_next) = corner_values(corners, x), corner_values(corners, n)
     # How near a point is to each corner, along the side that follows the corner and along the one before it.
     ahead, back = jnp.stack([1 - u, 1 - v, u, v]), jnp.stack([1 - v, u, v, 1 - u])
     of_tangent_ahead, of_tangent_back = ahead**2 * (1 - ahead), back**2 * (1 - back)
