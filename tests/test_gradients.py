@@ -47,7 +47,7 @@ class Derivatives(NamedTuple):
 
 def derivatives(case: Case, at: list[Point], along: list[Point]) -> Derivatives:
     topology = js.build_topology(control_mesh(MESHES[case.scheme.takes]), case.scheme, 1)
-    n = jax.eval_shape(js.refine, case.scheme, topology, at[0][1]).vertices.shape[0]
+    n = jax.eval_shape(js.refine, at[0][0], topology, at[0][1]).vertices.shape[0]
     weights = np.random.default_rng(0).normal(size=(2 * n, 3))
 
     def refined(scheme: js.AbstractScheme, control: js.Control) -> jax.Array:

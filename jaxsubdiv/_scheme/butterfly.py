@@ -19,7 +19,9 @@ class ModifiedButterfly(AbstractPrimalScheme):
     Edges between vertices of valence 6 take the eight-point rule; one with an extraordinary end the rule of that end's
     ring, and one with two the mean of both. Boundary edges take the four-point rule along the boundary. A wing that
     lies beyond a boundary is the mirror image of the corner on this side of it, and an end on the boundary counts as
-    regular: our choice, as the source leaves several.
+    regular: our choice, as the source leaves several. VTK agrees to its single precision but at edges from inside to
+    the boundary, where it takes other corners for the missing wings, and so moves points by up to an eighth of an edge
+    even in a plane.
 
     Source: N. Dyn, D. Levin & J. Gregory, A butterfly subdivision scheme for surface interpolation with tension
     control, 1990; D. Zorin, P. Schroeder & W. Sweldens, Interpolating subdivision for meshes with arbitrary topology,

@@ -23,6 +23,10 @@ class Loop(AbstractCreasedScheme):
         boundary: "edge-and-corner" keeps vertices of a single face where they are, "edge-only" rounds them off. Either
             way a boundary is the cubic B-spline of its own vertices.
 
+    Peers: OpenSubdiv, VTK (1987, "edge-only") and libigl (Warren, "edge-only") agree to rounding, open meshes included;
+    trimesh (1987) on closed meshes, while on open ones it moves some boundary vertices off their boundary, by up to
+    half an edge. OpenSubdiv's limit normals at boundary vertices of other than three triangles are of other rules.
+
     Raises:
         ValueError: an option is not one of these.
 
