@@ -1,9 +1,15 @@
-"""Differentiable interpolating subdivision surfaces of triangles and quads, in JAX."""
+"""Differentiable subdivision surfaces of triangles and quads, in JAX."""
 
 from importlib.metadata import version as _version
 
+from ._admissible import admissible_margin as admissible_margin
 from ._control import Control as Control
+from ._creases import Creases as Creases
+from ._curvature import Curvatures as Curvatures
+from ._curvature import curvatures as curvatures
 from ._errors import MeshError as MeshError
+from ._evaluate import SurfaceJet as SurfaceJet
+from ._evaluate import evaluate_control as evaluate_control
 from ._io import PointCloud as PointCloud
 from ._io import read_mesh as read_mesh
 from ._io import read_points as read_points
@@ -12,8 +18,16 @@ from ._mesh import ControlMesh as ControlMesh
 from ._normals import estimate_normals as estimate_normals
 from ._refine import refine as refine
 from ._scheme.base import AbstractScheme as AbstractScheme
+from ._scheme.bezier_triangle import BezierTriangle as BezierTriangle
+from ._scheme.butterfly import ModifiedButterfly as ModifiedButterfly
+from ._scheme.catmull_clark import CatmullClark as CatmullClark
 from ._scheme.circle_preserving import CirclePreserving as CirclePreserving
+from ._scheme.doo_sabin import DooSabin as DooSabin
 from ._scheme.interpolating import Interpolating as Interpolating
+from ._scheme.kobbelt import Kobbelt as Kobbelt
+from ._scheme.loop import Loop as Loop
+from ._stencils import interpolating_control as interpolating_control
+from ._stencils import stencils as stencils
 from ._surface import PointsAndNormals as PointsAndNormals
 from ._surface import RefinedSurface as RefinedSurface
 from ._surface import SurfacePoint as SurfacePoint

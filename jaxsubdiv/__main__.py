@@ -1,4 +1,4 @@
-"""Refine a mesh file: `python -m jaxsubdiv IN OUT --levels 3`."""
+"""Refine a mesh file: `python -m jaxsubdiv IN OUT --levels 3`; or compare the schemes on one."""
 
 import argparse
 import sys
@@ -7,14 +7,14 @@ from typing import get_args
 
 import jax
 
-from ._control import Control
+from . import _compare
+from ._admissible import warn_of_folds
 from ._errors import MeshError
 from ._io import read_mesh, write_mesh
 from ._mesh import ControlMesh
 from ._normals import Boundary, Weights
 from ._refine import refine
 from ._scheme.base import AbstractScheme, OldNormals
-from ._scheme.circle_preserving import CirclePreserving
 from ._scheme.interpolating import Interpolating, Twist
 from ._topology import MAX_LEVELS, build_topology
 from ._warnings import plain_warnings
@@ -22,12 +22,14 @@ from ._warnings import plain_warnings
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns its exit status: 0, or 2 where the input or the arguments cannot be used."""
-    options = _parser().parse_args(arguments)
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    comparing = words[:1] == ["compare"]
+    options = _compare.parser().parse_args(words[1:]) if comparing else _parser().parse_args(words)
     # A file is refined once: twice the digits cost nothing that one would notice.
     jax.config.update("jax_enable_x64", True)
     try:
         with plain_warnings():
-            return _run(options)
+            return _compare.run(options) if comparing else _run(options)
     except (MeshError, OSError, ValueError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -41,8 +43,13 @@ def _run(options: argparse.Namespace) -> int:
             print(f"repaired: {sentence}")
     print(f"read     {options.input}: {_describe(mesh)}")
     scheme = _scheme(options)
+    if options.ignore_normals:
+        mesh = ControlMesh(mesh.vertices, mesh.faces)
+    control = mesh.control(weights=scheme.weights)
+    if mesh.normals is None and scheme.uses_normals and not scheme.recomputes_normals:
+        warn_of_folds(mesh, control)  # `build_topology` does where the normals were given
     topology = build_topology(mesh, scheme, options.levels, mesh_normals=options.normals_out == "mesh")
-    surface = refine(scheme, topology, _control(mesh, scheme, options.ignore_normals))
+    surface = refine(scheme, topology, control)
     write_mesh(options.output, surface)
     kinds = f"{len(surface.faces[3]):,} triangles, {len(surface.faces[4]):,} quads"
     print(f"wrote    {options.output}: {len(surface.vertices):,} vertices, {kinds}")
@@ -54,7 +61,8 @@ def _parser() -> argparse.ArgumentParser:
         prog="jaxsubdiv",
         description="Refine a mesh of triangles and quads by interpolating subdivision: every level makes four times "
         "the faces, and the vertices of the input stay where they are.",
-        epilog="Files: .obj .ply .off .stl .npz; .vtp .vtk .gii with the extra `io`. The formats differ in what they "
+        epilog="`jaxsubdiv compare MESH --truth SURFACE` measures all schemes on a mesh; see its own --help. "
+        "Files: .obj .ply .off .stl .npz; .vtp .vtk .gii with the extra `io`. The formats differ in what they "
         "hold: .stl has no quads. Exit status: 0 done, 2 the input or the arguments cannot be used.",
     )
     add = parser.add_argument
@@ -65,7 +73,6 @@ def _parser() -> argparse.ArgumentParser:
         "--h",
         type=float,
         nargs="+",
-        default=[1.0],
         metavar="H",
         help="tangent length coefficient, one number or one a level; 0 is flat (default: 1)",
     )
@@ -92,21 +99,21 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _scheme(options: argparse.Namespace) -> AbstractScheme:
-    h = options.h[0] if len(options.h) == 1 else options.h
+    kind = _compare.SCHEMES[options.scheme]
+    default = kind()
     names = ("twist", "weights", "old_normals", "boundary")
     chosen = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    if options.scheme == "interpolating":
-        return Interpolating(h, **chosen)
-    if chosen:
+    if chosen and not isinstance(default, Interpolating):
         flags = ", ".join("--" + name.replace("_", "-") for name in chosen)
-        raise ValueError(f"{flags}: only the scheme 'interpolating' has this choice. Leave it out with 'circle'.")
-    return CirclePreserving(h)
-
-
-def _control(mesh: ControlMesh, scheme: AbstractScheme, ignore_normals: bool) -> Control:
-    if ignore_normals:
-        mesh = ControlMesh(mesh.vertices, mesh.faces)
-    return mesh.control(weights=scheme.weights)
+        raise ValueError(
+            f"{flags}: only the scheme 'interpolating' has this choice. Leave it out with '{options.scheme}'."
+        )
+    if default.h is None:
+        if options.h is not None:
+            raise ValueError(f"--h: the scheme '{options.scheme}' has no tangent length. Leave it out.")
+        return default
+    h = [1.0] if options.h is None else options.h
+    return kind(h=h[0] if len(h) == 1 else h, **chosen)
 
 
 def _describe(mesh: ControlMesh) -> str:

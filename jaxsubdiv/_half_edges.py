@@ -2,7 +2,8 @@
 
 A half-edge is one side of one face, and runs counter-clockwise around it. Half-edges are numbered triangle by triangle,
 corner by corner, then quad by quad: side `c` of triangle `f` is `3 f + c`, side `c` of quad `f` is `3 t + 4 f + c`.
-Side `c` starts at corner `c`. Faces are numbered likewise: the triangles first, then the quads.
+Side `c` starts at corner `c`. Faces are numbered likewise: the triangles first, then the quads. Inside a dual
+refinement there are larger polygons too; they follow by size.
 """
 
 from typing import NamedTuple
@@ -32,8 +33,8 @@ def half_edges(faces: Faces) -> HalfEdges:
     start = _by_side(faces, 0)
     end = _by_side(faces, 1)
     before = _by_side(faces, -1)
-    n_triangles, n_quads = len(faces[3]), len(faces[4])
-    face = np.repeat(np.arange(n_triangles + n_quads), [3] * n_triangles + [4] * n_quads)
+    sizes = np.concatenate([np.full(len(faces[size]), size) for size in sorted(faces)])
+    face = np.repeat(np.arange(len(sizes)), sizes)
     low, high = np.minimum(start, end).astype(np.int64), np.maximum(start, end).astype(np.int64)
     stride = int(high.max(initial=0)) + 1
     keys, edge = np.unique(low * stride + high, return_inverse=True)
@@ -42,4 +43,4 @@ def half_edges(faces: Faces) -> HalfEdges:
 
 def _by_side(faces: Faces, ahead: int) -> Int[np.ndarray, "s"]:
     """For every half-edge the corner that lies `ahead` of its start."""
-    return np.concatenate([np.roll(faces[size], -ahead, axis=1).ravel() for size in (3, 4)])
+    return np.concatenate([np.roll(faces[size], -ahead, axis=1).ravel() for size in sorted(faces)])

@@ -139,6 +139,12 @@ class ControlMesh:
 
         return repair(self, merge_within)
 
+    def triangulated(self) -> "ControlMesh":
+        """A copy with every quad cut from its first to its third corner, after the triangles that there are."""
+        quads = self.faces[4]
+        halves = np.stack([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
+        return ControlMesh(self.vertices, {3: np.concatenate([self.faces[3], halves])}, self.normals)
+
     def name_faces(self, rows: ArrayLike) -> str:
         """Faces, triangles numbered first and then quads, by the words of whoever passed them."""
         return self._names.join(np.asarray(rows))

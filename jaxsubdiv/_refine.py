@@ -5,11 +5,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._control import Control
-from ._linalg import unit
+from ._linalg import cross, largest, unit, unit_or
 from ._normals import fan_normals
-from ._scheme.base import AbstractScheme, gather_edges, new_normals
+from ._scheme.base import AbstractScheme
 from ._surface import RefinedSurface
-from ._topology import Level, Topology
+from ._topology import Level, LimitMasks, Topology
 
 
 def refine(scheme: AbstractScheme, topology: Topology, control: Control) -> RefinedSurface:
@@ -50,32 +50,33 @@ def _refine(
     # the normals of small faces; every rule is free of the origin, so the middle of the mesh serves.
     origin = jax.lax.stop_gradient(jnp.mean(control.vertices, axis=0, keepdims=True))
     x, n = control.vertices - origin, unit(control.normals)
-    h = scheme.h.astype(x.dtype)
+    h = None if scheme.h is None else scheme.h.astype(x.dtype)
     for i, level in enumerate(topology.levels):
         last = i == len(topology.levels) - 1
         recompute = scheme.recomputes_normals or (topology.mesh_normals and last)
-        x, n = _refine_level(scheme, h if h.ndim == 0 else h[i], level, x, n, recompute)
+        x, n = scheme.refine_level(h if h is None or h.ndim == 0 else h[i], level, x, n, recompute)
+    if topology.limit is not None:
+        x, n = _at_limit(topology, topology.limit, x, scheme)
+    elif topology.fans is not None:
+        n = fan_normals(topology.fans, x, x, jnp.zeros_like(x), scheme.weights)
+    if not scheme.interpolates:
+        return x + origin, n
     n_control = control.vertices.shape[0]
     return jnp.concatenate([control.vertices, x[n_control:] + origin]), n
 
 
-def _refine_level(
-    scheme: AbstractScheme,
-    h: Float[Array, ""],
-    level: Level,
-    x: Float[Array, "v 3"],
-    n: Float[Array, "v 3"],
-    recompute: bool,
+def _at_limit(
+    topology: Topology, limit: LimitMasks, x: Float[Array, "w 3"], scheme: AbstractScheme
 ) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
-    edges = gather_edges(level, x, n)
-    edge_points = scheme.edge_points(h, edges)
-    face_points = scheme.face_points(h, level, x, n, edges, edge_points)
-    refined = jnp.concatenate([x, edge_points, face_points])
-    edge_normals, face_normals = new_normals(scheme, level, edges, n, refined)
-    if recompute:
-        assert level.old_fans is not None  # see _check
-        n = fan_normals(level.old_fans, x, refined, n, scheme.weights)
-    return refined, jnp.concatenate([n, edge_normals, face_normals])
+    """Every vertex in its place on the limit surface, and the normal there; that of the mesh where it has none."""
+    assert topology.fans is not None
+    points = limit.points(x)
+    n = fan_normals(topology.fans, points, points, jnp.zeros_like(x), scheme.weights)
+    if limit.tangents is None:
+        return points, n
+    first, second = (tangent(x) for tangent in limit.tangents)
+    rounding = 16 * jnp.finfo(x.dtype).eps * largest(first) * largest(second)
+    return points, unit_or(cross(first, second), n, rounding)
 
 
 def _check(scheme: AbstractScheme, topology: Topology, control: Control) -> None:
@@ -87,13 +88,18 @@ def _check(scheme: AbstractScheme, topology: Topology, control: Control) -> None
         )
     if x.dtype != n.dtype:
         raise ValueError(f"vertices and normals must have one dtype; got {x.dtype} and {n.dtype}.")
-    levels = len(topology.levels)
-    if scheme.h.ndim > 1 or (scheme.h.ndim == 1 and scheme.h.shape[0] != levels):
+    if topology.built_for != scheme.tables_for:
+        raise ValueError(
+            f"the topology was built for {topology.built_for}, and this scheme needs its own, for {scheme.tables_for}. "
+            "Build it with `build_topology(mesh, scheme, levels)` for this scheme."
+        )
+    levels, h = len(topology.levels), scheme.h
+    if h is not None and (h.ndim > 1 or (h.ndim == 1 and h.shape[0] != levels)):
         raise ValueError(
             f"the topology has {levels} levels, so `h` must be a scalar or have the shape [{levels}]; got "
-            f"{list(scheme.h.shape)}."
+            f"{list(h.shape)}."
         )
-    if scheme.recomputes_normals and any(level.old_fans is None for level in topology.levels):
+    if scheme.recomputes_normals and any(isinstance(a, Level) and a.old_fans is None for a in topology.levels):
         raise ValueError(
             'the topology was built for a scheme that keeps old normals, but this one has old_normals="recompute". '
             "Build it with `build_topology(mesh, scheme, levels)` for this scheme."

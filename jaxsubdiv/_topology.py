@@ -1,27 +1,39 @@
-"""Topology of the refinement: integer tables, built once in numpy, that the values then run through.
+"""Topology of the refinement: tables, built once in numpy, that the values then run through.
 
-A level splits every triangle and every quad into four. Its new vertices are the edge vertices, one an edge, then the
-face vertices, one a quad, both numbered after the vertices that there are: a coarser level is a prefix of a finer one.
-Only the control mesh is sorted; the edges of every finer level follow from those of the coarser one by arithmetic.
+A primal level keeps the vertices that there are and numbers the new ones after them, the edge vertices first, one an
+edge, then the face vertices: a coarser level is a prefix of a finer one. A dual level numbers all of its vertices anew.
+The tables of the schemes of points and normals are integers alone; those of linear schemes hold weights too.
 """
 
 import operator
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Int
 
+from ._admissible import warn_of_folds
+from ._creases import Creases, sharpened
+from ._errors import MeshError
 from ._fans import Fans, as_table, group_corners, mesh_fans
-from ._half_edges import Faces
+from ._half_edges import Faces, half_edges
+from ._masks import Masks
 from ._mesh import ControlMesh
+from ._stage import Stage, numbers, stage_of
 
 MAX_LEVELS = 8
 _MAX_INDEX = np.iinfo(np.int32).max
 
 
-class Level(eqx.Module):
+class AbstractLevel(eqx.Module):
+    """Tables of one splitting step, whatever the scheme."""
+
+    edges: eqx.AbstractVar[Int[Array, "e 2"]]
+    """Ends of every edge of the mesh that is split."""
+
+
+class Level(AbstractLevel):
     """Tables of one splitting step, from `v` vertices, `e` edges and `q` quads to `v + e + q` vertices."""
 
     edges: Int[Array, "e 2"] = eqx.field(converter=as_table)
@@ -39,18 +51,43 @@ class Level(eqx.Module):
     """Corners around the old vertices in the refined mesh; only where their normals are computed anew."""
 
 
-class Topology(eqx.Module):
-    """Fixed tables of a refinement: integer leaves alone, so that meshes of equal sizes share one compilation."""
+class MaskLevel(AbstractLevel):
+    """Tables of one splitting step of a linear scheme."""
 
-    levels: tuple[Level, ...]
+    edges: Int[Array, "e 2"] = eqx.field(converter=as_table)
+    masks: Masks
+    """Weights of the vertices of the next level over those of this one; where old vertices stay as they are, of the
+    new ones alone."""
+
+
+class LimitMasks(eqx.Module):
+    """Where the vertices of the last level lie on the limit surface, and two tangents there."""
+
+    points: Masks
+    tangents: tuple[Masks, Masks] | None
+    """Their cross product is the normal; None where only the position is known."""
+
+
+class Topology(eqx.Module):
+    """Fixed tables of a refinement: leaves alone, so that meshes of equal sizes share one compilation."""
+
+    levels: tuple[AbstractLevel, ...]
     control_fans: Fans
     """Corners around the control vertices in the control mesh."""
     control_faces: dict[int, Int[Array, "_ _"]]
     faces: dict[int, Int[Array, "_ _"]]
-    """Faces of the last level. The descendants of control face `i` of a size are the rows `i 4^L` to `(i+1) 4^L - 1`
-    of that size, oriented like it."""
+    """Faces of the last level, oriented like those of the control mesh. Under the split of most schemes the descendants
+    of control face `i` of a size are the rows `i 4^L` to `(i+1) 4^L - 1` of that size. Catmull-Clark's first level
+    makes three quads of a triangle, which then stand before those of the quads. A dual scheme has no such order."""
+    fans: Fans | None
+    """Corners around the vertices of the last level, its polygons not yet cut into triangles; only where the normals
+    are those of the refined mesh."""
+    limit: LimitMasks | None
+    """Only where they were asked for."""
     mesh_normals: bool = eqx.field(static=True)
     """Whether the last level's normals are those of the refined mesh at the old vertices too."""
+    built_for: str = eqx.field(static=True)
+    """`tables_for` of the scheme that the tables were built for."""
 
     @property
     def n_control_vertices(self) -> int:
@@ -59,44 +96,110 @@ class Topology(eqx.Module):
 
 
 @runtime_checkable  # the tests check annotations while they run
-class RecomputesNormals(Protocol):
+class BuildsTables(Protocol):
     """What the tables need to know of a scheme."""
 
+    takes: ClassVar[tuple[int, ...]]
+    uses_normals: ClassVar[bool]
+    takes_creases: ClassVar[bool]
+
+    @property
+    def tables_for(self) -> str: ...
     @property
     def recomputes_normals(self) -> bool: ...
+    def level(self, stage: Stage, recompute: bool) -> AbstractLevel: ...
+    def split(self, stage: Stage) -> Stage: ...
+    def limit(self, stage: Stage) -> LimitMasks: ...
 
 
 def build_topology(
-    mesh: ControlMesh, scheme: RecomputesNormals, levels: int, *, mesh_normals: bool = False
+    mesh: ControlMesh,
+    scheme: BuildsTables,
+    levels: int,
+    *,
+    mesh_normals: bool = False,
+    creases: Creases | None = None,
+    limit: bool = False,
 ) -> Topology:
     """Tables for refining `mesh` by `levels` levels.
 
     Args:
         mesh: the control mesh; only its faces and its number of vertices matter here.
-        scheme: the scheme that will run on the tables: some need more of them than others.
+        scheme: the scheme that will run on the tables: each has tables of its own, and some more than others.
         levels: how many splitting steps, 0 to 8; each makes four times the faces (eq. (7)).
         mesh_normals: put out, at the last level, the normals (4)-(6) of the refined mesh at every vertex, instead of
-            the scheme's own. They differ only at vertices older than the last level.
+            the scheme's own. They differ only at vertices older than the last level. Linear schemes know no others.
+        creases: sharp edges and vertices, for `CatmullClark` and `Loop`.
+        limit: after the last level, move every vertex to its place on the limit surface, and put out the normals there:
+            for linear schemes.
 
     Raises:
-        ValueError: `levels` is no whole number from 0 to 8, or the refined mesh would outgrow 32-bit indices.
-        MeshError: the mesh was made with `check=False` and does not pass.
+        ValueError: `levels` is no whole number from 0 to 8, the refined mesh would outgrow 32-bit indices, or the
+            scheme knows no creases or no limit masks.
+        MeshError: the mesh was made with `check=False` and does not pass, the scheme does not take faces of this kind,
+            or a crease is not an edge of the mesh.
+
+    Warns:
+        UserWarning: a normal that the mesh was given is not admissible, and the scheme keeps it; see
+            `admissible_margin`.
     """
     mesh.check()
+    _check_faces(mesh, scheme)
     levels = _checked_levels(mesh, levels)
-    stage = _first_stage(mesh)
+    if mesh.normals is not None and scheme.uses_normals and not scheme.recomputes_normals:
+        warn_of_folds(mesh)
+    stage = stage_of(len(mesh.vertices), mesh.faces, mesh.half_edges)
+    if creases is not None:
+        if not scheme.takes_creases:
+            raise ValueError(
+                f"{type(scheme).__name__} has no creases; CatmullClark and Loop do. In a scheme of points and normals "
+                "a zero normal leaves an edge straight at that end."
+            )
+        stage = sharpened(stage, creases)
     tables = []
     for i in range(levels):
         recompute = scheme.recomputes_normals or (mesh_normals and i == levels - 1)
-        tables.append(_level(stage, recompute))
-        stage = _split(stage)
+        tables.append(scheme.level(stage, recompute))
+        stage = scheme.split(stage)
+    faces = cut_polygons(stage.faces)
     return Topology(
         levels=tuple(tables),
         control_fans=mesh_fans(len(mesh.vertices), mesh.half_edges),
         control_faces=jax.tree.map(as_table, mesh.faces),
-        faces=jax.tree.map(as_table, stage.faces),
+        faces=jax.tree.map(as_table, faces),
+        fans=None if scheme.uses_normals else mesh_fans(stage.n_vertices, half_edges(stage.faces)),
+        limit=scheme.limit(stage) if limit else None,
         mesh_normals=mesh_normals,
+        built_for=scheme.tables_for,
     )
+
+
+def _check_faces(mesh: ControlMesh, scheme: BuildsTables) -> None:
+    kinds = {3: "triangles", 4: "quads"}
+    both = "take a scheme for both, such as Interpolating or CatmullClark"
+    ways = {
+        3: f"Cut the quads with `mesh.triangulated()`, or {both}.",
+        4: f"Make quads of all faces first, as one level of CatmullClark does, or {both}.",
+    }
+    first = 0
+    for size, faces in mesh.faces.items():
+        if len(faces) and size not in scheme.takes:
+            other = next(iter(scheme.takes))
+            raise MeshError(
+                f"{type(scheme).__name__} takes {kinds[other]} only, but the mesh has {len(faces)} {kinds[size]} "
+                f"({mesh.name_faces(np.arange(first, first + len(faces)))}). {ways[other]}"
+            )
+        first += len(faces)
+
+
+def cut_polygons(faces: Faces) -> Faces:
+    """Faces of five and more corners as triangles around their first corner, after the triangles that there are."""
+    cut = [faces[3]]
+    for size in sorted(set(faces) - {3, 4}):
+        rows = faces[size]
+        fans = [np.stack([rows[:, 0], rows[:, i], rows[:, i + 1]], axis=1) for i in range(1, size - 1)]
+        cut.append(np.stack(fans, axis=1).reshape(-1, 3))
+    return {3: np.concatenate(cut), 4: faces[4]}
 
 
 def _checked_levels(mesh: ControlMesh, levels: int) -> int:
@@ -115,44 +218,8 @@ def _checked_levels(mesh: ControlMesh, levels: int) -> int:
     return levels
 
 
-class _Stage(NamedTuple):
-    """One level's mesh while its tables are built. Sides are half-edges, numbered as in `_half_edges`."""
-
-    n_vertices: int
-    faces: Faces
-    face_edges: dict[int, Int[np.ndarray, "_ _"]]
-    """Edge that follows each corner of every face."""
-    edges: Int[np.ndarray, "e 2"]
-    left: Int[np.ndarray, "e"]
-    """The side that runs along the edge from its first end to its second."""
-    right: Int[np.ndarray, "e"]
-    """The side that runs back, or -1 on a boundary."""
-
-
-def _first_stage(mesh: ControlMesh) -> _Stage:
-    sides = mesh.half_edges
-    n_edges, numbers = len(sides.edges), _numbers(len(sides.start))
-    forward = sides.start < sides.end
-    left, right = np.full((2, n_edges), -1, np.int32)
-    left[sides.edge[forward]] = numbers[forward]
-    right[sides.edge[~forward]] = numbers[~forward]
-    turned = left < 0  # a boundary edge whose only face runs against it: take it the other way round
-    left, right = np.where(turned, right, left), np.where(turned, left, right)
-    edges = np.where(turned[:, None], sides.edges[:, ::-1], sides.edges).astype(np.int32)
-    n_triangle_sides = 3 * len(mesh.faces[3])
-    face_edges = {
-        3: sides.edge[:n_triangle_sides].reshape(-1, 3).astype(np.int32),
-        4: sides.edge[n_triangle_sides:].reshape(-1, 4).astype(np.int32),
-    }
-    return _Stage(len(mesh.vertices), mesh.faces, face_edges, edges, left, right)
-
-
-def _numbers(n: int) -> Int[np.ndarray, "n"]:
-    """0 to n - 1 in 32 bits: the tables are bound by memory, and twice as fast to build so."""
-    return np.arange(n, dtype=np.int32)
-
-
-def _level(stage: _Stage, recompute: bool) -> Level:
+def point_normal_level(stage: Stage, recompute: bool) -> Level:
+    """Tables for a scheme of points and normals, with those around the old vertices if their normals change."""
     return Level(
         edges=stage.edges,
         wings=_wings(stage),
@@ -162,104 +229,23 @@ def _level(stage: _Stage, recompute: bool) -> Level:
     )
 
 
-def _wings(stage: _Stage) -> Int[np.ndarray, "e w"]:
+def _wings(stage: Stage) -> Int[np.ndarray, "e w"]:
     """Other neighbours of every edge vertex: the next edge vertices in a triangle, the centre of a quad."""
     n, n_edges = stage.n_vertices, len(stage.edges)
     n_quads = len(stage.faces[4])
-    centres = np.repeat(n + n_edges + _numbers(n_quads), 4)
+    centres = np.repeat(n + n_edges + numbers(n_quads), 4)
     width = 2 if len(stage.faces[3]) else 1
     sides = []
     for ahead in range(1, width + 1):
         in_triangle = n + np.roll(stage.face_edges[3], -ahead, axis=1).ravel()
         sides.append(np.concatenate([in_triangle, centres]))
     beside = np.stack(sides, axis=1)
-    itself = (n + _numbers(n_edges))[:, None]
+    itself = (n + numbers(n_edges))[:, None]
     right = np.where(stage.right[:, None] < 0, itself, beside[stage.right])
     return np.concatenate([beside[stage.left], right], axis=1)
 
 
-def _split(stage: _Stage) -> _Stage:
-    """The mesh of the next level. Every face keeps its place: its four children stand at `4 i` to `4 i + 3`.
-
-    Child `c` of a face lies at corner `c` and starts there; the fourth child of a triangle is its middle. Edge `i`
-    becomes `2 i` and `2 i + 1`, each running the way of its parent; then come three inner edges a triangle, from the
-    edge vertex of side `c` to that of side `c - 1`, and four a quad, from the edge vertex of side `c` to the centre.
-    """
-    n, n_edges = stage.n_vertices, len(stage.edges)
-    triangles, quads = stage.faces[3], stage.faces[4]
-    n_triangles, n_quads = len(triangles), len(quads)
-    first_quad_side = 12 * n_triangles
-
-    def inner(size: int) -> Int[np.ndarray, "_ _"]:
-        count = len(stage.faces[size])
-        return (2 * n_edges + (3 * n_triangles if size == 4 else 0) + _numbers(size * count)).reshape(count, size)
-
-    def back(table: Int[np.ndarray, "_ _"]) -> Int[np.ndarray, "_ _"]:
-        return np.roll(table, 1, axis=1)
-
-    def halves(size: int) -> tuple[Int[np.ndarray, "_ _"], Int[np.ndarray, "_ _"]]:
-        """The half of each side's edge at the start of the side, and the half at its end."""
-        edge = stage.face_edges[size]
-        runs_back = stage.edges[edge, 0] != stage.faces[size]
-        return 2 * edge + runs_back, 2 * edge + ~runs_back
-
-    q3, q4 = n + stage.face_edges[3], n + stage.face_edges[4]
-    centre = np.broadcast_to((n + n_edges + _numbers(n_quads))[:, None], (n_quads, 4))
-    (near3, far3), (near4, far4) = halves(3), halves(4)
-    inner3, inner4 = inner(3), inner(4)
-
-    corner_children = np.stack([triangles, q3, back(q3)], axis=2)
-    corner_edges = np.stack([near3, inner3, back(far3)], axis=2)
-    middle_edges = np.roll(inner3, -1, axis=1)
-    faces = {
-        3: np.concatenate([corner_children, q3[:, None]], axis=1).reshape(-1, 3),
-        4: np.stack([quads, q4, centre, back(q4)], axis=2).reshape(-1, 4),
-    }
-    face_edges = {
-        3: np.concatenate([corner_edges, middle_edges[:, None]], axis=1).reshape(-1, 3),
-        4: np.stack([near4, inner4, back(inner4), back(far4)], axis=2).reshape(-1, 4),
-    }
-
-    # The sides of the children, by corner of the parent: child `c` and which of its own sides.
-    child3 = 4 * _numbers(n_triangles)[:, None] + _numbers(3)
-    child4 = 4 * _numbers(n_quads)[:, None] + _numbers(4)
-    middle_side = 3 * (4 * _numbers(n_triangles)[:, None] + 3) + _numbers(3)
-    starts = np.concatenate([(3 * child3).ravel(), (first_quad_side + 4 * child4).ravel()])
-    ends = np.concatenate(
-        [(3 * np.roll(child3, -1, 1) + 2).ravel(), (first_quad_side + 4 * np.roll(child4, -1, 1) + 3).ravel()]
-    )
-    middle = n + _numbers(n_edges)
-    no_right = stage.right < 0
-    right_start, right_end = (np.where(no_right, -1, sides[stage.right]) for sides in (starts, ends))
-    return _Stage(
-        n_vertices=n + n_edges + n_quads,
-        faces=faces,
-        face_edges=face_edges,
-        edges=np.concatenate(
-            [
-                np.stack([stage.edges[:, 0], middle, middle, stage.edges[:, 1]], axis=1).reshape(-1, 2),
-                np.stack([q3, back(q3)], axis=2).reshape(-1, 2),
-                np.stack([q4, centre], axis=2).reshape(-1, 2),
-            ]
-        ),
-        left=np.concatenate(
-            [
-                np.stack([starts[stage.left], ends[stage.left]], axis=1).ravel(),
-                (3 * child3 + 1).ravel(),
-                (first_quad_side + 4 * child4 + 1).ravel(),
-            ]
-        ),
-        right=np.concatenate(
-            [
-                np.stack([right_end, right_start], axis=1).ravel(),
-                back(middle_side).ravel(),
-                (first_quad_side + 4 * np.roll(child4, -1, 1) + 2).ravel(),
-            ]
-        ),
-    )
-
-
-def _old_fans(stage: _Stage) -> Fans:
+def _old_fans(stage: Stage) -> Fans:
     """Corners around the old vertices in the refined mesh: there the neighbours are edge vertices."""
     start = np.concatenate([stage.faces[size].ravel() for size in (3, 4)])
     edge = [stage.face_edges[size] for size in (3, 4)]

@@ -14,7 +14,10 @@ import pytest
 from meshes import Mesh
 
 import jaxsubdiv as js
+from jaxsubdiv._scheme.bezier_triangle import PatchLevel
+from jaxsubdiv._topology import MaskLevel
 
+INTERPOLATING = ("Kobbelt", "ModifiedButterfly")
 LEVELS = 2
 # One mesh holds what a rule can meet, so that every scheme is compiled once for most of the tests: both kinds of faces,
 # closed and open components, valences 1 to 7 and faces that share one vertex only.
@@ -23,8 +26,28 @@ PARTS = (meshes.mixed_closed(), meshes.fan(7), meshes.grid(3, 2, "mixed", bumpy=
 PART = np.repeat(range(len(PARTS)), [len(vertices) for vertices, _ in PARTS])
 SHEET = 2
 MIXED = meshes.union(*PARTS)
+# The like for schemes that take one kind of faces only.
+CUT = (MIXED[0], [half for face in MIXED[1] for half in (face[:3], face[::2] + face[3:])[: len(face) - 2]])
+TWO_QUADS = (
+    np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (-1, 0, 0.5), (-1, -1, 0), (0, -1, 0)]),
+    [(0, 1, 2, 3), (0, 4, 5, 6)],
+)
+QUAD_PARTS = (meshes.cube(), meshes.torus(4, 3), meshes.grid(3, 2, bumpy=0.2), TWO_QUADS)
 QUADS = meshes.union(meshes.cube(), meshes.torus(4, 3), meshes.grid(3, 2, bumpy=0.2))
 TRIANGLES = meshes.union(meshes.fan(7), meshes.torus(4, 3, "triangle"), meshes.grid(2, 2, "triangle", bumpy=0.2))
+
+
+class Subject(NamedTuple):
+    """A mesh that a scheme takes, the component of each of its vertices, and values on it."""
+
+    mesh: Mesh
+    part: np.ndarray
+    x: np.ndarray
+    n: np.ndarray
+
+    @property
+    def control(self) -> js.Control:
+        return js.Control(self.x, self.n)
 
 
 class Case(NamedTuple):
@@ -32,12 +55,39 @@ class Case(NamedTuple):
 
     name: str
     scheme: js.AbstractScheme
-    reference: dict[str, Any]
+    reference: dict[str, Any] | None
     lacks: frozenset[str] = frozenset()
 
     def with_h(self, h: Any) -> js.AbstractScheme:
-        """The same scheme with another h."""
-        return dataclasses.replace(self.scheme, h=h)
+        """The same scheme with h in every place, if it has one."""
+        if self.scheme.h is None:
+            return self.scheme
+        return dataclasses.replace(self.scheme, h=np.full(self.scheme.h.shape, h))
+
+    @property
+    def subject(self) -> Subject:
+        """What most tests refine with this scheme."""
+        return _subject(self.scheme.takes)
+
+    @property
+    def topology(self) -> js.Topology:
+        """Its tables."""
+        key = self.scheme.tables_for, self.scheme.recomputes_normals
+        if key not in _TOPOLOGIES:
+            _TOPOLOGIES[key] = js.build_topology(control_mesh(self.subject.mesh), self.scheme, LEVELS)
+        return _TOPOLOGIES[key]
+
+
+_TOPOLOGIES: dict[tuple[str, bool], js.Topology] = {}
+
+
+@functools.cache
+def _subject(takes: tuple[int, ...]) -> Subject:
+    parts = QUAD_PARTS if takes == (4,) else PARTS
+    part = np.repeat(range(len(parts)), [len(vertices) for vertices, _ in parts])
+    mesh = {(3, 4): MIXED, (3,): CUT, (4,): meshes.union(*QUAD_PARTS)}[takes]
+    control = random_control(mesh, seed=5)
+    return Subject(mesh, part, np.asarray(control.vertices), np.asarray(control.normals))
 
 
 def _interpolating(twist: str, weights: str, old_normals: str, boundary: str, h: Any = 1.1) -> Case:
@@ -62,6 +112,14 @@ CASES = [
     _interpolating("zero", "area", "keep", "fan", h=[1.2, 0.7]),
     Case("circle", js.CirclePreserving(1.1), {"scheme": "circle"}),
     Case("circle-h_by_level", js.CirclePreserving([1.2, 0.7]), {"scheme": "circle"}),
+    Case("bezier-triangle", js.BezierTriangle(), None, frozenset({"sphere"})),
+    Case("catmull-clark", js.CatmullClark(), None, frozenset({"sphere", "blocks of children"})),
+    Case("catmull-clark-edge-only", js.CatmullClark("edge-only"), None, frozenset({"sphere", "blocks of children"})),
+    Case("doo-sabin", js.DooSabin(), None, frozenset({"sphere", "blocks of children", "whole polygons"})),
+    Case("kobbelt", js.Kobbelt(), None, frozenset({"sphere"})),
+    Case("loop", js.Loop(), None, frozenset({"sphere"})),
+    Case("loop-warren-edge-only", js.Loop("warren", "edge-only"), None, frozenset({"sphere"})),
+    Case("butterfly", js.ModifiedButterfly(), None, frozenset({"sphere"})),
 ]
 
 
@@ -69,9 +127,14 @@ def by_name(name: str) -> Case:
     return next(case for case in CASES if case.name == name)
 
 
-def over_cases(*needs: str):
-    """Run a test for every scheme that does not lack what the test needs."""
-    cases = [case for case in CASES if not case.lacks.intersection(needs)]
+def over_cases(*needs: str, **claims: bool):
+    """Run a test for every scheme that does not lack what the test needs, and claims of itself what it asks."""
+    cases = [
+        case
+        for case in CASES
+        if not case.lacks.intersection(needs)
+        and all(getattr(case.scheme, claim) == value for claim, value in claims.items())
+    ]
     return pytest.mark.parametrize("case", cases, ids=lambda case: case.name)
 
 
@@ -81,15 +144,9 @@ def control_mesh(mesh: Mesh) -> js.ControlMesh:
     return js.ControlMesh(vertices, sorted(faces, key=len))
 
 
-@functools.cache
-def mixed_topology(recompute: bool) -> js.Topology:
-    scheme = js.Interpolating(old_normals="recompute" if recompute else "keep")
-    return js.build_topology(control_mesh(MIXED), scheme, LEVELS)
-
-
-def refine_mixed(case: Case, control: js.Control) -> js.RefinedSurface:
-    """Refine with the faces of `MIXED`, triangles first."""
-    return on_host(js.refine(case.scheme, mixed_topology(case.scheme.recomputes_normals), control))
+def refined(case: Case, control: js.Control) -> js.RefinedSurface:
+    """Refine with the faces of the case's own mesh, triangles first."""
+    return on_host(js.refine(case.scheme, case.topology, control))
 
 
 def on_host(surface: js.RefinedSurface) -> js.RefinedSurface:
@@ -98,10 +155,18 @@ def on_host(surface: js.RefinedSurface) -> js.RefinedSurface:
 
 
 def inherited(topology: js.Topology, values: np.ndarray) -> np.ndarray:
-    """A value for every control vertex, handed down to the mean of the parents' values. Labels of components stay."""
+    """A value for every control vertex, handed down to a mean of the parents' values. Labels of components stay."""
     for level in topology.levels:
-        parents = [np.asarray(level.edges), np.asarray(level.quads)]
-        values = np.concatenate([values, *(values[rows].mean(axis=1) for rows in parents)])
+        if isinstance(level, MaskLevel):
+            new = level.masks.matrix() @ values
+            # Interpolating schemes have rows for new vertices alone.
+            values = np.concatenate([values, new]) if topology.built_for.startswith(INTERPOLATING) else new
+        elif isinstance(level, PatchLevel):
+            places = [values[np.asarray(at.corners)].mean(axis=1) for at in (level.in_triangles, level.in_quads)]
+            values = np.concatenate([values, np.concatenate(places)[np.asarray(level.order)]])
+        else:
+            parents = [np.asarray(level.edges), np.asarray(level.quads)]
+            values = np.concatenate([values, *(values[rows].mean(axis=1) for rows in parents)])
     return values
 
 

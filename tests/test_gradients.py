@@ -4,6 +4,7 @@ One level holds every rule and puts out the normals too. The operations run one 
 compiled once for all schemes, while compiling each scheme's second derivatives whole would take minutes.
 """
 
+import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -21,6 +22,12 @@ BATCH = 12
 STEP = 1e-5
 VERTICES, FACES = meshes.pyramid()
 MESH = (VERTICES, FACES[:-1])  # a quad and three triangles, with edges inside and on the boundary
+# The like for schemes that take one kind of faces only.
+MESHES = {
+    (3, 4): MESH,
+    (3,): (VERTICES, [(3, 2, 1), (3, 1, 0), *FACES[1:-1]]),
+    (4,): (np.array([(0, 0, 0), (2, 0, 0.4), (2, 2, 0), (0, 2, 0.2), (4, 0, 0.6)]), [(0, 1, 2, 3), (1, 4, 3, 2)]),
+}
 
 Point = tuple[js.AbstractScheme, js.Control]
 
@@ -39,9 +46,9 @@ class Derivatives(NamedTuple):
 
 
 def derivatives(case: Case, at: list[Point], along: list[Point]) -> Derivatives:
-    topology = js.build_topology(control_mesh(MESH), case.scheme, 1)
-    n = 2 * (len(VERTICES) + sum(len(rows) for rows in (topology.levels[0].edges, topology.levels[0].quads)))
-    weights = np.random.default_rng(0).normal(size=(n, 3))
+    topology = js.build_topology(control_mesh(MESHES[case.scheme.takes]), case.scheme, 1)
+    n = jax.eval_shape(js.refine, at[0][0], topology, at[0][1]).vertices.shape[0]
+    weights = np.random.default_rng(0).normal(size=(2 * n, 3))
 
     def refined(scheme: js.AbstractScheme, control: js.Control) -> jax.Array:
         surface = js.refine(scheme, topology, control)
@@ -61,7 +68,8 @@ def derivatives(case: Case, at: list[Point], along: list[Point]) -> Derivatives:
 
 
 def point(case: Case, control: js.Control) -> Point:
-    return case.with_h(case.scheme.h if case.scheme.h.ndim == 0 else case.scheme.h[:1]), control
+    h = case.scheme.h
+    return (case.scheme if h is None or h.ndim == 0 else dataclasses.replace(case.scheme, h=h[:1])), control
 
 
 def moved(at: Point, along: Point, step: float) -> Point:
@@ -71,12 +79,14 @@ def moved(at: Point, along: Point, step: float) -> Point:
 @functools.cache
 def at_random(name: str) -> Derivatives:
     """Rows 3 i, 3 i + 1, 3 i + 2: a random point, and the same a step ahead and a step back along direction i: h, the
-    vertices, the normals, and all of them."""
+    vertices, the normals, and all of them, where the scheme depends on them."""
     case = by_name(name)
-    at = point(case, random_control(MESH, seed=0, bumps=0.2))
+    at = point(case, random_control(MESHES[case.scheme.takes], seed=0, bumps=0.2))
     rng = np.random.default_rng(1)
-    h, x, n = (rng.normal(size=leaf.shape) for leaf in jax.tree.leaves(at))
-    parts = [(h, 0 * x, 0 * n), (0 * h, x, 0 * n), (0 * h, 0 * x, n), (h, x, n)]
+    leaves = [rng.normal(size=leaf.shape) for leaf in jax.tree.leaves(at)]
+    used = range(len(leaves) if case.scheme.uses_normals else len(leaves) - 1)  # the normals come last
+    chosen = [[i] for i in used] + [list(used)] * 4
+    parts = [[leaf * (i in some) for i, leaf in enumerate(leaves)] for some in chosen[: BATCH // 3]]
     along = [jax.tree.unflatten(jax.tree.structure(at), list(map(jnp.asarray, part))) for part in parts]
     steps = [(t, step) for t in along for step in (0.0, STEP, -STEP)]
     return derivatives(case, [moved(at, t, step) for t, step in steps], [t for t, _ in steps])
@@ -112,7 +122,7 @@ def test_second_derivatives_agree_with_differences_of_the_first(case):
     np.testing.assert_allclose(rows(d.hessian_vector)[::3], differences, rtol=0, atol=1e-6)
 
 
-@over_cases()
+@over_cases(uses_normals=True)
 def test_length_of_a_normal_is_a_null_direction(case):
     d = at_random(case.name)
     slopes, normals = d.gradient[1].normals, d.at[1].normals
@@ -162,7 +172,7 @@ def test_derivatives_are_finite_where_formulas_have_none(case, corner):
     assert np.abs(rows(d.gradient)[row]).max() < 1e4
 
 
-@over_cases()
+@over_cases(tables_for="points and normals")
 def test_normal_is_that_of_the_parents_where_the_sum_vanishes(case):
     d, row = at_corners(case.name), list(CORNERS).index("folded")
     level = js.build_topology(control_mesh(MESH), case.scheme, 1).levels[0]
@@ -175,13 +185,13 @@ def test_normal_is_that_of_the_parents_where_the_sum_vanishes(case):
         np.testing.assert_allclose(normals[vertex], mean / np.linalg.norm(mean), rtol=0, atol=1e-14)
 
 
-@over_cases()
+@over_cases(uses_normals=True)
 def test_gradient_is_zero_in_a_zero_normal(case):
     d = at_corners(case.name)
     one, every = (list(CORNERS).index(name) for name in ("zero normal", "zero normals"))
     assert not np.any(d.gradient[1].normals[one, 0]) and np.any(d.gradient[1].normals[one, 1])
     assert not np.any(d.gradient[1].normals[every])
-    assert not np.any(d.gradient[0].h[every])
+    assert case.scheme.h is None or not np.any(d.gradient[0].h[every])
 
 
 @pytest.mark.parametrize("degrees", [0, 60, 119, 121, 180])
@@ -194,11 +204,12 @@ def test_circle_factor_is_flat_beyond_120_degrees_only(degrees):
     assert np.any(slope) == (degrees < 120)
 
 
-@pytest.mark.parametrize(("name", "levels"), [("default", 2), ("circle", 1)])
+@pytest.mark.parametrize(("name", "levels"), [("default", 2), ("circle", 1), ("loop", 2)])
 def test_compiled_gradients_of_a_batch_agree_with_central_differences(name, levels):
     case = by_name(name)
-    topology = js.build_topology(control_mesh(MESH), case.scheme, levels)
-    at = point(case, random_control(MESH, seed=2, bumps=0.2))
+    mesh = MESHES[case.scheme.takes]
+    topology = js.build_topology(control_mesh(mesh), case.scheme, levels)
+    at = point(case, random_control(mesh, seed=2, bumps=0.2))
     rng = np.random.default_rng(3)
     along = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), at)
 
@@ -216,7 +227,7 @@ def test_compiled_gradients_of_a_batch_agree_with_central_differences(name, leve
 @over_cases()
 def test_rows_of_a_batch_run_one_by_one_equal_compiled_single_runs(case):
     d = at_random(case.name)
-    topology = js.build_topology(control_mesh(MESH), case.scheme, 1)
+    topology = js.build_topology(control_mesh(MESHES[case.scheme.takes]), case.scheme, 1)
     for row in (0, 7):
         scheme, control = jax.tree.map(lambda leaf, row=row: leaf[row], d.at)
         surface = js.refine(scheme, topology, control)

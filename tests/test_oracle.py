@@ -14,7 +14,7 @@ ONE_KIND = {
     # Compiled for these, edge vertices once differed by rounding from their own copies in their rings.
     "triangles": (TRIANGLES, ["default", "uniform-recompute", "printed-sphere"]),
 }
-PAIRS = [pytest.param(case, MIXED, id=case.name) for case in CASES] + [
+PAIRS = [pytest.param(case, MIXED, id=case.name) for case in CASES if case.reference is not None] + [
     pytest.param(by_name(name), mesh, id=f"{name}-{kind}") for kind, (mesh, names) in ONE_KIND.items() for name in names
 ]
 

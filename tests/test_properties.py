@@ -12,24 +12,21 @@ from schemes import (
     CASES,
     LEVELS,
     MIXED,
-    PART,
     SHEET,
+    Case,
     by_name,
     control_mesh,
     inherited,
-    mixed_topology,
     on_host,
     over_cases,
-    random_control,
-    refine_mixed,
+    refined,
 )
 
 import jaxsubdiv as js
 from jaxsubdiv._refine import _refine
 
-KEEPING = [case for case in CASES if not case.scheme.recomputes_normals]
-CONTROL = random_control(MIXED, seed=5)
-X, N = np.asarray(CONTROL.vertices), np.asarray(CONTROL.normals)
+DEFAULT = by_name("default")
+CONTROL, X, N, PART = DEFAULT.subject.control, DEFAULT.subject.x, DEFAULT.subject.n, DEFAULT.subject.part
 ROTATION = np.linalg.qr(np.random.default_rng(6).normal(size=(3, 3)))[0]
 ROTATION *= np.linalg.det(ROTATION)
 
@@ -44,49 +41,61 @@ def unit(rows) -> np.ndarray:
     return np.asarray(rows) / np.linalg.norm(rows, axis=-1, keepdims=True)
 
 
-def part_of_vertex(topology: js.Topology) -> np.ndarray:
-    return inherited(topology, PART).astype(int)
+def part_of_vertex(case: Case) -> np.ndarray:
+    return np.round(inherited(case.topology, case.subject.part)).astype(int)
 
 
 # ------------------------------------------------------------------------------------------------ what stays as it is
 
 
-@over_cases()
+@over_cases(interpolates=True)
 def test_control_vertices_are_copied_bit_by_bit(case):
-    surface = refine_mixed(case, CONTROL)
-    assert np.array_equal(surface.vertices[: len(PART)], X)
+    surface = refined(case, case.subject.control)
+    assert np.array_equal(surface.vertices[: len(case.subject.x)], case.subject.x)
 
 
-@pytest.mark.parametrize("case", KEEPING, ids=lambda case: case.name)
+@over_cases(interpolates=False)
+def test_approximating_schemes_move_the_control_vertices(case):
+    surface = refined(case, case.subject.control)
+    assert np.linalg.norm(surface.vertices[: len(case.subject.x)] - case.subject.x, axis=1).max() > 0.1
+
+
+@over_cases(uses_normals=True, recomputes_normals=False)
 def test_kept_normals_are_the_control_normals_made_unit(case):
-    surface = refine_mixed(case, CONTROL)
-    np.testing.assert_allclose(surface.normals[: len(PART)], unit(N), rtol=0, atol=1e-15)
+    surface = refined(case, case.subject.control)
+    np.testing.assert_allclose(surface.normals[: len(case.subject.n)], unit(case.subject.n), rtol=0, atol=1e-15)
+
+
+@over_cases(uses_normals=False)
+def test_control_normals_change_nothing_where_they_are_not_used(case):
+    surface, other = refined(case, case.subject.control), refined(case, js.Control(case.subject.x, 0 * case.subject.n))
+    assert np.array_equal(surface.vertices, other.vertices) and np.array_equal(surface.normals, other.normals)
 
 
 @over_cases()
 def test_normals_have_length_one(case):
-    np.testing.assert_allclose(np.linalg.norm(refine_mixed(case, CONTROL).normals, axis=1), 1, rtol=0, atol=1e-15)
+    lengths = np.linalg.norm(refined(case, case.subject.control).normals, axis=1)
+    np.testing.assert_allclose(lengths, 1, rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("h", [0.0, 0.5, 1.0, 2.5])
 @over_cases()
 def test_planes_stay_planes(case, h):
-    flat = X * (1, 1, 0) @ ROTATION.T + 3
+    flat = case.subject.x * (1, 1, 0) @ ROTATION.T + 3
     up = ROTATION[:, 2]
     control = js.Control(flat, np.outer(np.linspace(0.5, 2, len(flat)), up))
-    topology = mixed_topology(case.scheme.recomputes_normals)
-    surface = on_host(js.refine(case.with_h(np.full(case.scheme.h.shape, h)), topology, control))
-    sheet = part_of_vertex(topology) == SHEET  # the closed parts are pressed flat: their sides face both ways
+    surface = refined(case._replace(scheme=case.with_h(h)), control)
+    sheet = part_of_vertex(case) == SHEET  # the closed parts are pressed flat: their sides face both ways
     np.testing.assert_allclose((surface.vertices[sheet] - 3) @ up, 0, atol=1e-12)
     np.testing.assert_allclose(surface.normals[sheet], np.tile(up, (sheet.sum(), 1)), rtol=0, atol=1e-12)
 
 
-@over_cases("flat at h = 0")
+@pytest.mark.parametrize("case", [c for c in CASES if c.scheme.h is not None], ids=lambda case: case.name)
 def test_h_zero_is_flat_midpoint_splitting(case):
-    scheme = case.with_h(np.zeros(case.scheme.h.shape))
-    topology = mixed_topology(scheme.recomputes_normals)
-    surface = on_host(js.refine(scheme, topology, CONTROL))
-    np.testing.assert_allclose(surface.vertices, inherited(topology, X), rtol=0, atol=1e-14)
+    if "flat at h = 0" in case.lacks:
+        pytest.skip("the printed twist bends quads at h = 0 too")
+    surface = refined(case._replace(scheme=case.with_h(0.0)), CONTROL)
+    np.testing.assert_allclose(surface.vertices, inherited(case.topology, X), rtol=0, atol=1e-14)
 
 
 def test_unused_vertices_survive_and_change_nothing():
@@ -126,14 +135,15 @@ def test_eight_levels_run():
 
 @over_cases()
 def test_moves_with_a_rigid_motion(case):
-    surface = refine_mixed(case, CONTROL)
-    moved = refine_mixed(case, js.Control(X @ ROTATION.T + 7.0, N @ ROTATION.T))
+    x, n = case.subject.x, case.subject.n
+    surface = refined(case, case.subject.control)
+    moved = refined(case, js.Control(x @ ROTATION.T + 7.0, n @ ROTATION.T))
     np.testing.assert_allclose(moved.vertices, surface.vertices @ ROTATION.T + 7.0, rtol=0, atol=1e-12)
     np.testing.assert_allclose(moved.normals, surface.normals @ ROTATION.T, rtol=0, atol=1e-12)
 
 
 def scaled(case, factor: float) -> tuple[js.RefinedSurface, js.RefinedSurface]:
-    return refine_mixed(case, CONTROL), refine_mixed(case, js.Control(factor * X, N))
+    return refined(case, case.subject.control), refined(case, js.Control(factor * case.subject.x, case.subject.n))
 
 
 @pytest.mark.parametrize("factor", [1e-3, 25.4])
@@ -166,13 +176,14 @@ def cycles(faces: dict, label: np.ndarray | None = None) -> set[tuple[int, ...]]
 
 @over_cases()
 def test_names_and_order_of_vertices_and_faces_do_not_matter(case):
-    told, of_vertex, _ = meshes.relabelled(MIXED, seed=3, turn="first corner" not in case.lacks)
+    told, of_vertex, _ = meshes.relabelled(case.subject.mesh, seed=3, turn="first corner" not in case.lacks)
     topology = js.build_topology(js.ControlMesh(*told), case.scheme, LEVELS)
-    other = on_host(js.refine(case.scheme, topology, js.Control(X[of_vertex], N[of_vertex])))
-    surface = refine_mixed(case, CONTROL)
+    other = on_host(js.refine(case.scheme, topology, js.Control(case.subject.x[of_vertex], case.subject.n[of_vertex])))
+    surface = refined(case, case.subject.control)
     at = match(other, surface)
     np.testing.assert_allclose(other.normals, surface.normals[at], rtol=0, atol=1e-12)
-    assert cycles(other.faces, at) == cycles(surface.faces)
+    if "whole polygons" not in case.lacks:  # where a polygon is cut does depend on its first corner
+        assert cycles(other.faces, at) == cycles(surface.faces)
 
 
 @pytest.mark.parametrize("case", [case for case in CASES if "first corner" in case.lacks], ids=lambda case: case.name)
@@ -180,28 +191,31 @@ def test_printed_twist_depends_on_the_first_corner_of_a_quad(case):
     turned = [face[1:] + face[:1] for face in MIXED[1]]
     topology = js.build_topology(control_mesh((MIXED[0], turned)), case.scheme, LEVELS)
     other = on_host(js.refine(case.scheme, topology, CONTROL))
-    assert np.abs(other.vertices - refine_mixed(case, CONTROL).vertices).max() > 1e-2
+    assert np.abs(other.vertices - refined(case, CONTROL).vertices).max() > 1e-2
 
 
 @over_cases("first corner")
 def test_turns_inside_out_with_the_faces_and_the_normals(case):
-    turned = [face[:1] + face[:0:-1] for face in MIXED[1]]
-    topology = js.build_topology(control_mesh((MIXED[0], turned)), case.scheme, LEVELS)
-    other = on_host(js.refine(case.scheme, topology, js.Control(X, -N)))
-    surface = refine_mixed(case, CONTROL)
+    vertices, faces = case.subject.mesh
+    turned = [face[:1] + face[:0:-1] for face in faces]
+    topology = js.build_topology(control_mesh((vertices, turned)), case.scheme, LEVELS)
+    other = on_host(js.refine(case.scheme, topology, js.Control(case.subject.x, -case.subject.n)))
+    surface = refined(case, case.subject.control)
     at = match(other, surface)
     np.testing.assert_allclose(other.normals, -surface.normals[at], rtol=0, atol=1e-12)
+    if "whole polygons" in case.lacks:
+        return
     assert cycles({size: rows[:, ::-1] for size, rows in other.faces.items()}, at) == cycles(surface.faces)
 
 
 @over_cases()
 def test_components_do_not_feel_one_another(case):
-    others = PART != SHEET
+    others = case.subject.part != SHEET
     rng = np.random.default_rng(4)
-    shaken = X + others[:, None] * rng.normal(size=X.shape)
-    turned = N * np.where(others, -1, 1)[:, None]
-    surface, other = refine_mixed(case, CONTROL), refine_mixed(case, js.Control(shaken, turned))
-    sheet = part_of_vertex(mixed_topology(case.scheme.recomputes_normals)) == SHEET
+    shaken = case.subject.x + others[:, None] * rng.normal(size=case.subject.x.shape)
+    turned = case.subject.n * np.where(others, -1, 1)[:, None]
+    surface, other = refined(case, case.subject.control), refined(case, js.Control(shaken, turned))
+    sheet = part_of_vertex(case) == SHEET
     np.testing.assert_allclose(other.vertices[sheet], surface.vertices[sheet], rtol=0, atol=1e-13)
     np.testing.assert_allclose(other.normals[sheet], surface.normals[sheet], rtol=0, atol=1e-13)
     assert np.abs(other.vertices[~sheet] - surface.vertices[~sheet]).max() > 0.1
@@ -339,16 +353,15 @@ def on_a_sphere() -> np.ndarray:
 @over_cases("sphere")
 def test_spheres_are_kept_by_schemes_that_claim_it(case):
     normals, centre, radius = on_a_sphere(), np.array([3.0, -1.0, 2.0]), 5.0
-    one = case._replace(scheme=case.with_h(np.ones(case.scheme.h.shape)))
-    surface = refine_mixed(one, js.Control(centre + radius * normals, normals))
+    surface = refined(case._replace(scheme=case.with_h(1.0)), js.Control(centre + radius * normals, normals))
     np.testing.assert_allclose(surface.vertices, centre + radius * surface.normals, rtol=0, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(surface.vertices - centre, axis=1), radius, rtol=1e-13)
 
 
 def test_interpolating_scheme_leaves_a_sphere():
     normals = on_a_sphere()
-    one = by_name("default")._replace(scheme=js.Interpolating())
-    lengths = np.linalg.norm(refine_mixed(one, js.Control(normals, normals)).vertices, axis=1)
+    one = DEFAULT._replace(scheme=js.Interpolating())
+    lengths = np.linalg.norm(refined(one, js.Control(normals, normals)).vertices, axis=1)
     assert np.abs(lengths - 1).max() > 0.01
 
 
@@ -380,13 +393,16 @@ def test_every_level_has_four_times_the_faces_and_the_same_euler_number():
         assert len(finer.boundary_edges) == 2**levels * len(mesh.boundary_edges)
 
 
-@over_cases("scale")
+@over_cases("scale", "blocks of children")
 def test_faces_keep_the_side_of_their_parents(case):
-    surface = refine_mixed(case, js.ControlMesh(*MIXED).control())
-    for size, parents in control_mesh(MIXED).faces.items():
+    mesh = control_mesh(case.subject.mesh)
+    surface = refined(case, mesh.control())
+    for size, parents in mesh.faces.items():
+        if not len(parents):
+            continue
         before, after = (
             unit(areas(vertices, faces))
-            for vertices, faces in ((MIXED[0], parents), (surface.vertices, surface.faces[size]))
+            for vertices, faces in ((mesh.vertices, parents), (surface.vertices, surface.faces[size]))
         )
         cosines = np.sum(np.repeat(before, 4**LEVELS, axis=0) * after, axis=1)
         assert cosines.min() > 0.5
@@ -398,15 +414,17 @@ def areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.cross(corners[:, 2] - corners[:, 0], corners[:, -1] - corners[:, 1])
 
 
-def test_coarser_levels_are_prefixes_of_finer_ones():
-    case = by_name("default")
-    finer = refine_mixed(case, CONTROL)
-    topology = js.build_topology(control_mesh(MIXED), case.scheme, LEVELS - 1)
-    coarser = js.refine(case.scheme, topology, CONTROL)
+@pytest.mark.parametrize("name", ["default", "bezier-triangle", "butterfly", "kobbelt"])
+def test_coarser_levels_are_prefixes_of_finer_ones(name):
+    case = by_name(name)
+    finer = refined(case, case.subject.control)
+    topology = js.build_topology(control_mesh(case.subject.mesh), case.scheme, LEVELS - 1)
+    coarser = js.refine(case.scheme, topology, case.subject.control)
     n = len(coarser.vertices)
-    assert len(X) < n < len(finer.vertices)
+    assert len(case.subject.x) < n < len(finer.vertices)
     np.testing.assert_allclose(coarser.vertices, finer.vertices[:n], rtol=0, atol=1e-14)
-    np.testing.assert_allclose(coarser.normals, finer.normals[:n], rtol=0, atol=1e-14)
+    if case.scheme.uses_normals:
+        np.testing.assert_allclose(coarser.normals, finer.normals[:n], rtol=0, atol=1e-14)
 
 
 # ------------------------------------------------------------------------------------------------------------- normals
@@ -414,7 +432,7 @@ def test_coarser_levels_are_prefixes_of_finer_ones():
 
 @pytest.mark.parametrize("weights", ["area", "uniform", "angle", "sphere"])
 def test_estimated_normals_agree_with_the_reference(weights):
-    topology = mixed_topology(False)
+    topology = DEFAULT.topology
     ours = js.estimate_normals(topology.control_fans, CONTROL.vertices, weights)
     np.testing.assert_allclose(ours, reference.vertex_normals(X, MIXED[1], weights), rtol=0, atol=1e-13)
     of_mesh = js.ControlMesh(X, MIXED[1]).control(weights=weights)
@@ -438,15 +456,13 @@ def test_mesh_normals_are_those_of_the_last_level(name):
 # -------------------------------------------------------------------------------------------- precision, compilation
 
 
-def test_single_precision_stays_single_and_agrees():
-    case = by_name("default")
-    topology = mixed_topology(False)
-    single = js.Control(X.astype(np.float32), N.astype(np.float32))
-    surface = js.refine(case.scheme, topology, single)
+@pytest.mark.parametrize("name", ["default", "bezier-triangle", "catmull-clark", "butterfly"])
+def test_single_precision_stays_single_and_agrees(name):
+    case = by_name(name)
+    single = js.Control(case.subject.x.astype(np.float32), case.subject.n.astype(np.float32))
+    surface = js.refine(case.scheme, case.topology, single)
     assert surface.vertices.dtype == surface.normals.dtype == np.float32
-    expected = refine_mixed(
-        case, js.Control(*(np.asarray(rows, np.float64) for rows in (single.vertices, single.normals)))
-    )
+    expected = refined(case, js.Control(*(np.asarray(rows, np.float64) for rows in (single.vertices, single.normals))))
     np.testing.assert_allclose(surface.vertices, expected.vertices, rtol=0, atol=2e-6)
     np.testing.assert_allclose(surface.normals, expected.normals, rtol=0, atol=2e-5)
 
@@ -467,7 +483,7 @@ def test_single_precision_holds_a_metre_from_the_origin():
 
 
 def test_only_new_sizes_options_and_dtypes_compile_anew():
-    topology = mixed_topology(False)
+    topology = DEFAULT.topology
     js.refine(js.Interpolating(), topology, CONTROL)
     compiled = _refine._cache_size()
     for h in (1.2, 1, np.float64(0.9), jnp.asarray(0.9), jnp.asarray(0.9, jnp.float64)):
@@ -482,12 +498,11 @@ def test_only_new_sizes_options_and_dtypes_compile_anew():
 
 @over_cases()
 def test_refinement_is_gathers_and_sums_without_scatters(case):
-    topology = mixed_topology(case.scheme.recomputes_normals)
-    program = _refine.lower(case.scheme, topology, CONTROL).as_text()
+    program = _refine.lower(case.scheme, case.topology, case.subject.control).as_text()
     assert "gather" in program and "scatter" not in program
 
 
 def test_gradients_have_the_scatters_that_a_search_would_find():
-    topology, scheme = mixed_topology(False), js.Interpolating()
+    topology, scheme = DEFAULT.topology, js.Interpolating()
     slope = jax.jit(jax.grad(lambda control: js.refine(scheme, topology, control).vertices.sum()))
     assert "scatter" in slope.lower(CONTROL).as_text()

@@ -1,7 +1,7 @@
-"""What the engine asks of a scheme, and what every scheme of points and normals shares."""
+"""What the engine asks of a scheme, and what the schemes of a kind share."""
 
 from abc import abstractmethod
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,8 +9,10 @@ from jaxtyping import Array, Bool, Float
 
 from .._control import strong_float
 from .._linalg import largest, take, unit, unit_or
-from .._normals import Boundary, Weights, chord_normals, ring_sum
-from .._topology import Level
+from .._masks import Matrix, as_masks, identity, stack
+from .._normals import Boundary, Weights, chord_normals, fan_normals, ring_sum
+from .._stage import Sides, Stage, hybrid_split, sides_of
+from .._topology import AbstractLevel, Level, LimitMasks, MaskLevel, point_normal_level
 
 OldNormals: TypeAlias = Literal["keep", "recompute"]
 
@@ -50,22 +52,83 @@ def check_option(name: str, value: str, allowed: tuple[str, ...]) -> None:
 
 
 class AbstractScheme(eqx.Module):
-    """An interpolating scheme: rules for the new points and for the normals. `refine` owns the loop.
+    """Rules that make the points and normals of the next level. `refine` owns the loop.
 
     A rule sees one level: its tables, and the positions and unit normals of the vertices that there are. It never sees
     the level's number, or other levels.
     """
 
-    h: eqx.AbstractVar[Float[Array, "..."]]
+    h: eqx.AbstractVar[Any]
+    """Tangent length, `Float[Array, ""]` or one a level; None in schemes that have none."""
     weights: eqx.AbstractVar[Weights]
     """How corner normals are weighed in (6)."""
+
+    takes: ClassVar[tuple[int, ...]] = (3, 4)
+    """Numbers of corners of the faces that it takes."""
+    interpolates: ClassVar[bool]
+    """Whether control vertices stay where they are."""
+    is_linear: ClassVar[bool]
+    """Whether new vertices are weighted sums of the control vertices, with weights that the faces alone decide."""
+    uses_normals: ClassVar[bool]
+    """Whether the surface depends on the control normals."""
+    is_primal: ClassVar[bool] = True
+    """Whether the vertices of a level are the first of the next one, moved or not."""
+    takes_creases: ClassVar[bool] = False
+    """Whether `build_topology` may be given creases."""
+    order: ClassVar[int]
+    """Power of the edge length by which the first new vertices come closer to a smooth surface through the control
+    vertices (with its own normals), on regular meshes."""
+
+    @property
+    def recomputes_normals(self) -> bool:
+        """Whether old vertices get new normals at every level."""
+        return False
+
+    @property
+    def tables_for(self) -> str:
+        """Schemes that say the same here run on the same tables."""
+        return repr(self)
+
+    @abstractmethod
+    def level(self, stage: Stage, recompute: bool) -> AbstractLevel:
+        """Tables of one level, in numpy; `recompute` asks for those that new normals of old vertices need."""
+
+    @abstractmethod
+    def split(self, stage: Stage) -> Stage:
+        """The mesh of the next level."""
+
+    def limit(self, stage: Stage) -> LimitMasks:
+        """Weights of the limit surface at the vertices of a level."""
+        raise ValueError(
+            f"{type(self).__name__} has no limit masks; the linear schemes do. Build the tables without `limit`."
+        )
+
+    @abstractmethod
+    def refine_level(
+        self, h: Float[Array, ""] | None, level: Any, x: Float[Array, "v 3"], n: Float[Array, "v 3"], recompute: bool
+    ) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
+        """Positions and normals of the next level."""
+
+
+class AbstractPointNormalScheme(AbstractScheme):
+    """An interpolating scheme of points and normals: every face into four, normals by (4)-(6)."""
+
     boundary: eqx.AbstractVar[Boundary]
     """Where the normal of a new boundary vertex comes from."""
 
+    interpolates: ClassVar[bool] = True
+    is_linear: ClassVar[bool] = False
+    uses_normals: ClassVar[bool] = True
+
     @property
-    @abstractmethod
-    def recomputes_normals(self) -> bool:
-        """Whether old vertices get new normals at every level."""
+    def tables_for(self) -> str:
+        return "points and normals"
+
+    def level(self, stage: Stage, recompute: bool) -> Level:
+        return point_normal_level(stage, recompute)
+
+    def split(self, stage: Stage) -> Stage:
+        return hybrid_split(stage)
 
     @abstractmethod
     def edge_points(self, h: Float[Array, ""], edges: Edges) -> Float[Array, "e 3"]:
@@ -83,9 +146,78 @@ class AbstractScheme(eqx.Module):
     ) -> Float[Array, "q 3"]:
         """Positions of the face vertices, one in the middle of every quad."""
 
+    def refine_level(
+        self, h: Float[Array, ""] | None, level: Level, x: Float[Array, "v 3"], n: Float[Array, "v 3"], recompute: bool
+    ) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
+        assert h is not None
+        edges = gather_edges(level, x, n)
+        edge_points = self.edge_points(h, edges)
+        face_points = self.face_points(h, level, x, n, edges, edge_points)
+        refined = jnp.concatenate([x, edge_points, face_points])
+        edge_normals, face_normals = new_normals(self, level, edges, n, refined)
+        if recompute:
+            assert level.old_fans is not None  # see `_check` in `_refine`
+            n = fan_normals(level.old_fans, x, refined, n, self.weights)
+        return refined, jnp.concatenate([n, edge_normals, face_normals])
+
+
+class AbstractLinearScheme(AbstractScheme):
+    """A scheme whose new vertices are weighted sums of old ones. Its rules are sparse matrices, built on the host."""
+
+    is_linear: ClassVar[bool] = True
+    uses_normals: ClassVar[bool] = False
+
+    @abstractmethod
+    def masks(self, stage: Stage) -> Matrix:
+        """Weights of the vertices of the next level over those of this one, old vertices left out if they stay."""
+
+    def level(self, stage: Stage, recompute: bool) -> MaskLevel:
+        return MaskLevel(edges=stage.edges, masks=as_masks(self.masks(stage)))
+
+    def refine_level(
+        self,
+        h: Float[Array, ""] | None,
+        level: MaskLevel,
+        x: Float[Array, "v 3"],
+        n: Float[Array, "v 3"],
+        recompute: bool,
+    ) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
+        new = level.masks(x)
+        refined = jnp.concatenate([x, new]) if self.interpolates else new
+        return refined, jnp.zeros_like(refined)  # `refine` puts in those of the last mesh
+
+
+class AbstractPrimalScheme(AbstractLinearScheme):
+    """A linear scheme that splits faces: three rules, one a kind of new vertex."""
+
+    def limit(self, stage: Stage) -> LimitMasks:
+        """Where a scheme interpolates, vertices are on the limit; no masks of tangents are printed for those here."""
+        return LimitMasks(as_masks(identity(stage.n_vertices)), None)
+
+    def vertex_masks(self, stage: Stage, sides: Sides) -> Matrix:
+        """Weights `[v, v]` of the old vertices in their new places; never asked of a scheme that interpolates."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def edge_masks(self, stage: Stage, sides: Sides) -> Matrix:
+        """Weights `[e, v]` of the edge vertices."""
+
+    def face_masks(self, stage: Stage, sides: Sides) -> Matrix | None:
+        """Weights `[f, v]` of the face vertices; None where the split has none."""
+        return None
+
+    def masks(self, stage: Stage) -> Matrix:
+        sides = sides_of(stage)
+        old = None if self.interpolates else self.vertex_masks(stage, sides)
+        rows = [old, self.edge_masks(stage, sides), self.face_masks(stage, sides)]
+        return stack([matrix for matrix in rows if matrix is not None])
+
+    def split(self, stage: Stage) -> Stage:
+        return hybrid_split(stage)
+
 
 def new_normals(
-    scheme: AbstractScheme, level: Level, edges: Edges, n: Float[Array, "v 3"], x: Float[Array, "w 3"]
+    scheme: AbstractPointNormalScheme, level: Level, edges: Edges, n: Float[Array, "v 3"], x: Float[Array, "w 3"]
 ) -> tuple[Float[Array, "e 3"], Float[Array, "q 3"]]:
     """Unit normals of the edge vertices and of the face vertices, eqs. (4)-(6) on the refined faces around them.
 

@@ -1,5 +1,7 @@
 """The paper's split with rules that reproduce circles: spheres from any mesh on them."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -7,7 +9,7 @@ from jaxtyping import Array, Float
 from .._linalg import Rows, dot, take
 from .._normals import Boundary, Weights, chord_normals
 from .._topology import Level
-from .base import AbstractScheme, Edges, tangent_length
+from .base import AbstractPointNormalScheme, Edges, tangent_length
 from .interpolating import edge_rule
 
 
@@ -28,7 +30,7 @@ def arc_rule(h: Float[Array, ""], x_a: Rows, x_b: Rows, n_a: Rows, n_b: Rows) ->
     return edge_rule(h * arc_factor(n_a, n_b), x_a, x_b, n_a, n_b)
 
 
-class CirclePreserving(AbstractScheme):
+class CirclePreserving(AbstractPointNormalScheme):
     """A relative of the paper's scheme that reproduces circles: same split, same inputs, four formulas changed.
 
     With h = 1 a mesh with its corners and normals on a sphere is refined on the sphere, to rounding, as long as no two
@@ -48,10 +50,7 @@ class CirclePreserving(AbstractScheme):
     h: Float[Array, "..."] = eqx.field(converter=tangent_length, default=1.0)
     weights: Weights = eqx.field(static=True, default="sphere", init=False)
     boundary: Boundary = eqx.field(static=True, default="chord", init=False)
-
-    @property
-    def recomputes_normals(self) -> bool:
-        return False
+    order: ClassVar[int] = 4
 
     def edge_points(self, h: Float[Array, ""], edges: Edges) -> Float[Array, "e 3"]:
         return arc_rule(h, *edges)

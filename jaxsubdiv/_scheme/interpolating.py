@@ -1,6 +1,6 @@
 """The scheme of the paper: edge tangents from vertices and normals, eqs. (1)-(3)."""
 
-from typing import Literal, TypeAlias, get_args
+from typing import ClassVar, Literal, TypeAlias, get_args
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from .._linalg import Rows, dot, take
 from .._normals import Boundary, Weights
 from .._topology import Level
-from .base import AbstractScheme, Edges, OldNormals, check_option, corner_total, tangent_length
+from .base import AbstractPointNormalScheme, Edges, OldNormals, check_option, corner_total, tangent_length
 
 Twist: TypeAlias = Literal["zero", "printed"]
 
@@ -38,7 +38,7 @@ def coons_centre(level: Level, x: Float[Array, "v 3"], edge_points: Float[Array,
     return 0.5 * ((a + b) + (c + d)) - 0.25 * corner_total(level, x)
 
 
-class Interpolating(AbstractScheme):
+class Interpolating(AbstractPointNormalScheme):
     """The interpolating subdivision of Sisojevs & Glazs (2012), for triangles, quads and meshes of both.
 
     Control vertices stay where they are; smooth limit for 0 < h < 3, planes stay planes, order 4 in the edge length
@@ -63,6 +63,7 @@ class Interpolating(AbstractScheme):
     weights: Weights = eqx.field(static=True, default="area")
     old_normals: OldNormals = eqx.field(static=True, default="keep")
     boundary: Boundary = eqx.field(static=True, default="fan")
+    order: ClassVar[int] = 4
 
     def __check_init__(self):
         check_option("twist", self.twist, get_args(Twist))

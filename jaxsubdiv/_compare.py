@@ -1,0 +1,187 @@
+"""Every scheme on one control mesh against the surface that it stands for: `python -m jaxsubdiv compare`."""
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from ._distance import closest_on_mesh
+from ._files import replacing
+from ._io import read_mesh
+from ._mesh import ControlMesh
+from ._refine import refine
+from ._scheme.base import AbstractScheme
+from ._scheme.bezier_triangle import BezierTriangle
+from ._scheme.butterfly import ModifiedButterfly
+from ._scheme.catmull_clark import CatmullClark
+from ._scheme.circle_preserving import CirclePreserving
+from ._scheme.doo_sabin import DooSabin
+from ._scheme.interpolating import Interpolating
+from ._scheme.kobbelt import Kobbelt
+from ._scheme.loop import Loop
+from ._stencils import interpolating_control
+from ._surface import RefinedSurface, sample
+from ._topology import MAX_LEVELS, build_topology
+
+N_SAMPLES = 20_000
+
+SCHEMES: dict[str, Callable[..., AbstractScheme]] = {
+    "interpolating": Interpolating,
+    "circle": CirclePreserving,
+    "bezier-triangle": BezierTriangle,
+    "butterfly": ModifiedButterfly,
+    "kobbelt": Kobbelt,
+    "catmull-clark": CatmullClark,
+    "loop": Loop,
+    "doo-sabin": DooSabin,
+}
+"""Every scheme by its name on the command line."""
+
+
+class Row(NamedTuple):
+    """How one scheme does."""
+
+    name: str
+    triangles: int
+    """Faces of the refined surface, a quad counted as two."""
+    rms: float
+    """Distance of points on the surface, drawn by area, from the true one; in the unit of the mesh."""
+    largest: float
+    normals: float
+    """Root mean square angle between the surface's normal and the truth's there, in degrees."""
+    seconds: float
+    """Of one refinement, compiled before."""
+    surface: RefinedSurface
+
+
+def compare(mesh: ControlMesh, truth: ControlMesh, levels: int) -> tuple[list[Row], list[str]]:
+    """Refine `mesh` by every scheme that takes its faces, and measure how far each is from `truth`.
+
+    A scheme of triangles gets the quads cut, at the same level and so with as many triangles; Doo-Sabin and, on
+    triangles, Catmull-Clark come closest to that at the same level. Approximating schemes are shown twice: raw, and
+    with control vertices solved for so that their limit goes through the vertices of `mesh`.
+
+    Returns:
+        A row a scheme, and a sentence for each that was left out.
+    """
+    corners = truth.vertices[truth.triangulated().faces[3]]
+    true_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    true_normals /= np.linalg.norm(true_normals, axis=1, keepdims=True)
+    rows, left_out = [], []
+    for name, kind in SCHEMES.items():
+        scheme = kind()
+        if 3 not in scheme.takes and len(mesh.faces[3]):
+            left_out.append(f"{name} takes quads only")
+            continue
+        suited = mesh.triangulated() if 4 not in scheme.takes else mesh
+        topology = build_topology(suited, scheme, levels)
+        rows.append(_measured(name, scheme, topology, suited.control(), corners, true_normals))
+        if scheme.interpolates:
+            continue
+        try:
+            masks = build_topology(suited, scheme, 0, limit=True)
+            control = interpolating_control(scheme, masks, suited.vertices)
+        except ValueError as error:
+            left_out.append(f"{name}, solved: {str(error).split('.')[0]}")
+            continue
+        rows.append(_measured(f"{name}, solved", scheme, topology, control, corners, true_normals))
+    return rows, left_out
+
+
+def _measured(name, scheme, topology, control, corners, true_normals: Float[np.ndarray, "t 3"]) -> Row:
+    surface = jax.block_until_ready(refine(scheme, topology, control))
+    start = time.perf_counter()
+    jax.block_until_ready(refine(scheme, topology, control))
+    seconds = time.perf_counter() - start
+    drawn = sample(surface, N_SAMPLES, jax.random.key(0))
+    points, normals = (np.asarray(rows, np.float64) for rows in drawn)
+    distance, nearest = closest_on_mesh(points, corners)
+    cosine = np.clip(np.einsum("px,px->p", normals, true_normals[nearest]), -1, 1)
+    return Row(
+        name,
+        len(surface.faces[3]) + 2 * len(surface.faces[4]),
+        float(np.sqrt(np.mean(distance**2))),
+        float(distance.max()),
+        float(np.degrees(np.sqrt(np.mean(np.arccos(cosine) ** 2)))),
+        seconds,
+        surface,
+    )
+
+
+def table(rows: Sequence[Row]) -> str:
+    """The rows as text."""
+    lines = [f"{'scheme':<22}{'triangles':>11}{'RMS':>11}{'max':>11}{'normals':>10}{'time':>11}"]
+    for row in rows:
+        lines.append(
+            f"{row.name:<22}{row.triangles:>11,}{row.rms:>11.4g}{row.largest:>11.4g}{row.normals:>8.2f} °"
+            f"{1000 * row.seconds:>8.1f} ms"
+        )
+    return "\n".join(lines)
+
+
+def draw(path: Path, rows: Sequence[Row], truth: ControlMesh) -> None:
+    """All surfaces side by side, the true one first, seen from where the mesh is broadest."""
+    from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    middle, spread = truth.vertices.mean(axis=0), truth.vertices - truth.vertices.mean(axis=0)
+    _, _, axes = np.linalg.svd(spread[:: max(1, len(spread) // 2000)], full_matrices=False)
+    view = axes if np.linalg.det(axes) > 0 else -axes
+    light = np.array([0.3, 0.4, 0.866])
+    shown = [("the true surface", truth.vertices, truth.triangulated().faces[3])]
+    shown += [(row.name, np.asarray(row.surface.vertices), np.asarray(row.surface.triangles())) for row in rows]
+    columns = min(4, len(shown))
+    figure = Figure(figsize=(3 * columns, 3.2 * -(-len(shown) // columns)), layout="constrained")
+    for i, (title, vertices, triangles) in enumerate(shown):
+        corners = ((vertices - middle) @ view.T)[triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        shade = np.clip(np.abs(normals @ light) / np.where(length > 0, length, 1)[:, 0], 0, 1)
+        axis = figure.add_subplot(-(-len(shown) // columns), columns, i + 1, projection="3d")
+        colours = np.outer(0.25 + 0.75 * shade, (0.85, 0.8, 0.72))
+        axis.add_collection3d(Poly3DCollection(corners, facecolors=colours, edgecolors="none"))
+        low, high = ((truth.vertices - middle) @ view.T).min(axis=0), ((truth.vertices - middle) @ view.T).max(axis=0)
+        axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]), title=title)
+        axis.set_box_aspect(np.maximum(high - low, 1e-9))
+        axis.view_init(elev=90, azim=-90)
+        axis.set_axis_off()
+    with replacing(path) as unfinished:
+        figure.savefig(unfinished, dpi=120, format=path.suffix.lstrip(".") or "png")
+
+
+def run(options: argparse.Namespace) -> int:
+    """The subcommand, its arguments parsed."""
+    mesh, truth = read_mesh(options.input, scale=options.scale), read_mesh(options.truth, scale=options.scale)
+    if options.picture is not None:
+        import matplotlib  # noqa: F401  # before the work, so that a missing one is told at once
+    rows, left_out = compare(mesh, truth, options.levels)
+    print(table(rows))
+    for sentence in left_out:
+        print(f"left out: {sentence}")
+    if options.picture is not None:
+        draw(Path(options.picture), rows, truth)
+        print(f"wrote {options.picture}")
+    return 0
+
+
+def parser() -> argparse.ArgumentParser:
+    """Arguments of the subcommand."""
+    parser = argparse.ArgumentParser(
+        prog="jaxsubdiv compare",
+        description="Refine a control mesh by every scheme that takes its faces, at equal face counts, and measure how "
+        "far each surface is from the true one: distances in the unit of the mesh, of points drawn by area.",
+        epilog="Approximating schemes are shown raw and, as 'solved', with control vertices whose limit goes through "
+        "the vertices of the mesh. Exit status: 0 done, 2 the input or the arguments cannot be used.",
+    )
+    add = parser.add_argument
+    add("input", metavar="MESH", help="control mesh")
+    add("--truth", required=True, metavar="SURFACE", help="the surface that it stands for, as a fine mesh")
+    add("--levels", type=int, default=3, metavar="N", help=f"how many levels, 0 to {MAX_LEVELS} (default: 3)")
+    add("--scale", type=float, default=1.0, help="multiplies the coordinates of both (default: 1)")
+    add("--picture", metavar="FILE", help="all surfaces side by side, .png or .svg; needs the extra `viz`")
+    return parser
