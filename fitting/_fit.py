@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -30,6 +31,7 @@ _UNIT_RATIO = 20.0
 _LEAST_NOISE = 1e-4
 # Movements far below a control edge are at rest, however exact the scan.
 _AT_REST = 0.01
+_LEAST_MARGIN = 0.05  # of a control normal at the start; see `js.admissible_margin`
 _MOST = 0.9  # of the surface: so much of it has to be at rest
 
 
@@ -53,7 +55,7 @@ def fit(
     priors: Priors | None = None,
     loss: AbstractLoss | None = None,
     max_sweeps: int = 60,
-    tolerance: float = 0.25,
+    tolerance: float = 0.1,
     throw: bool = True,
     on_sweep: Callable[[Sweep], None] | None = None,
 ) -> FitResult:
@@ -158,10 +160,12 @@ def _uncertainty(seen: Look, control: js.Control) -> float:
 
 
 def _given_normals(topology: js.Topology, control: js.Control) -> Float[Array, "v 3"]:
-    """Unit normals; from the faces where a control vertex has none: a zero normal could not turn."""
-    normals = unit(control.normals)
-    missing = jnp.all(normals == 0, axis=1, keepdims=True)
-    return jnp.where(missing, js.estimate_normals(topology.control_fans, control.vertices), normals)
+    """Unit normals; from the faces where a control vertex has none, or has one that would fold the surface."""
+    normals = np.asarray(unit(control.normals))
+    mesh = js.ControlMesh(control.vertices, topology.control_faces, check=False)
+    usable = js.admissible_margin(mesh, js.Control(control.vertices, normals)) > _LEAST_MARGIN
+    of_faces = js.estimate_normals(topology.control_fans, control.vertices)
+    return jnp.where(jnp.asarray(usable)[:, None], normals, of_faces)
 
 
 def _warn_if_far(off: float, control: js.Control) -> None:
@@ -185,7 +189,7 @@ def _check(scheme: js.AbstractScheme, topology: js.Topology, control: js.Control
         raise ValueError(
             f"control mesh and scan must have JAX's default floating dtype, {default}; got {dtypes[0]} and {dtypes[1]}."
         )
-    if not all(np.isfinite(values).all() for values in (control.vertices, scheme.h)):
+    if not all(np.isfinite(values).all() for values in jax.tree.leaves((control.vertices, scheme))):
         raise ValueError("the control vertices or h are not finite: there is no surface to start from.")
     n_needed = control.vertices.shape[0]
     if scan.n_points < n_needed:

@@ -42,7 +42,6 @@ class Free(eqx.Module):
         Raises:
             ValueError: a mask has not one row a control vertex, or the scheme has nothing that is free.
         """
-        uses_normals = getattr(scheme, "uses_normals", True)
 
         def mask(name: str, of: bool | Bool[np.ndarray, "v"], width: int) -> Array | None:
             if not np.any(of):
@@ -54,7 +53,7 @@ class Free(eqx.Module):
 
         found = Unknowns(
             mask("vertices", self.vertices, 3),
-            mask("normals", self.normals, 2) if uses_normals else None,
+            mask("normals", self.normals, 2) if scheme.uses_normals else None,
             jnp.ones(scheme.h.shape, bool) if self.h and scheme.h is not None else None,
         )
         if found.vertices is None and found.normals is None and found.h is None:
@@ -105,10 +104,12 @@ def apply_offset(
 
 
 def edge_length(topology: js.Topology, vertices: Float[Array, "v 3"]) -> Float[Array, ""]:
-    """Root mean square length of the control edges."""
-    edges = topology.levels[0].edges
-    d = take(vertices, edges[:, 1]) - take(vertices, edges[:, 0])
-    return jnp.sqrt(jnp.mean(norm(d) ** 2))
+    """Root mean square length of the sides of the control faces."""
+    sides = []
+    for faces in topology.control_faces.values():
+        corners = take(vertices, faces)
+        sides.append((norm(jnp.roll(corners, -1, axis=1) - corners) ** 2).reshape(-1))
+    return jnp.sqrt(jnp.mean(jnp.concatenate(sides)))
 
 
 def h_effect(length: Float[Array, ""]) -> Float[Array, ""]:

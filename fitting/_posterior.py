@@ -5,10 +5,11 @@ priors. With the strength of the bend prior found from the scan, its bands hold 
 average over the surface. Source: D. Nychka, Bayesian confidence intervals for smoothing splines, 1988.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 import jaxsubdiv as js
 
@@ -38,28 +39,35 @@ class Posterior:
 
     def uncertainty(self) -> Uncertainty:
         """Exact for up to a few thousand unknowns; beyond, from random draws, to about 5 %."""
-        problem, columns = self.problem, self.problem.elements.columns
-        face, by = problem.across(self.scheme, self.control)
-        n = problem.elements.n
-        if np.sum(problem.is_free) <= _DENSE:
+        problem = self.problem
+        face, by_surface = problem.across(self.scheme, self.control)
+        columns, by_control = problem.across_control(self.control)
+        variance = self._variances()
+        surface, control = variance(problem.elements.columns[face], by_surface), variance(columns, by_control)
+        return Uncertainty(np.sqrt(np.maximum(control, 0)), np.sqrt(np.maximum(surface, 0)))
+
+    def _variances(self) -> Callable[[Int[np.ndarray, "m d"], Float[np.ndarray, "m d"]], Float[np.ndarray, "m"]]:
+        """Variances of sums of unknowns, given by their columns and factors."""
+        n, free = self.problem.elements.n, np.append(self.problem.is_free, False)  # one more, which nothing moves
+        covariance = draws = np.zeros((n + 1, 0))
+        exact = free.sum() <= _DENSE
+        if exact:
             covariance = np.zeros((n + 1, n + 1))
-            free = np.append(problem.is_free, False)
             covariance[np.ix_(free, free)] = np.linalg.inv(self.matrix.toarray())
-            variance = np.empty(len(by))
-            for first in range(0, len(by), _ROWS_AT_ONCE):
-                rows = slice(first, first + _ROWS_AT_ONCE)
-                at = columns[face[rows]]
-                block = covariance[at[:, :, None], at[:, None, :]]
-                variance[rows] = np.sum(np.matmul(block, by[rows][..., None])[..., 0] * by[rows], axis=1)
         else:
             draws = np.append(self.draws(_DRAWS), np.zeros((1, _DRAWS)), axis=0)
-            variance = np.empty(len(by))
-            for first in range(0, len(by), _ROWS_AT_ONCE):
-                rows = slice(first, first + _ROWS_AT_ONCE)
-                moved = np.einsum("md,mdk->mk", by[rows], draws[columns[face[rows]]])
-                variance[rows] = np.mean(moved**2, axis=1)
-        deviation = np.sqrt(np.maximum(variance, 0))
-        return Uncertainty(deviation[: self.control.vertices.shape[0]], deviation)
+
+        def of(columns: Int[np.ndarray, "k d"], by: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k"]:
+            if not exact:
+                return np.mean(np.einsum("md,mdk->mk", by, draws[columns]) ** 2, axis=1)
+            block = covariance[columns[:, :, None], columns[:, None, :]]
+            return np.sum(np.matmul(block, by[..., None])[..., 0] * by, axis=1)
+
+        def of_all(columns: Int[np.ndarray, "m d"], by: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m"]:
+            runs = range(0, len(by), _ROWS_AT_ONCE)
+            return np.concatenate([of(columns[i : i + _ROWS_AT_ONCE], by[i : i + _ROWS_AT_ONCE]) for i in runs])
+
+        return of_all
 
     def draws(self, n: int, seed: int = 0) -> Float[np.ndarray, "u n"]:
         """Random offsets of the unknowns, as probable as the posterior has them."""

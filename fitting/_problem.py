@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from scipy.sparse.linalg import SuperLU, splu
 
 import jaxsubdiv as js
+from jaxsubdiv._linalg import unit
 
 from ._elements import (
     Elements,
@@ -26,7 +27,17 @@ from ._elements import (
 from ._evidence import neighbourhoods, next_precision
 from ._free import Free, Unknowns, edge_length, no_offset
 from ._look import Look
-from ._residuals import Anchors, Pairs, Priors, Rows, Start, control_face, prior_faces
+from ._residuals import (
+    Anchors,
+    Pairs,
+    Priors,
+    Rows,
+    Start,
+    bend_edges,
+    control_edges,
+    control_faces_of,
+    prior_faces,
+)
 
 # Standard deviation of a step in control edges: what neither scan nor priors hold stays near where it is. A control
 # vertex that turns back is held faster, and one that goes on is let go again: where the surface cannot follow the scan
@@ -70,7 +81,10 @@ class Problem:
         self._zero = no_offset(free, scheme, control)
         masks = free.of(scheme, len(self._template))
         self.is_free = flat(masks).astype(bool)
-        self._faces = prior_faces(topology, anchors, 0 if masks.h is None else masks.h.size)
+        # A surface of any shape: only to tell which face lies where.
+        self._owner = control_faces_of(topology, js.refine(scheme, topology, control), control)
+        self._faces = prior_faces(scheme, topology, anchors, self._owner, 0 if masks.h is None else masks.h.size)
+        self._edges, self._bend_edges = control_edges(topology), bend_edges(topology)
         self._around = neighbourhoods(topology)
         self._edge = float(edge_length(topology, control.vertices))
         self._elements: Elements | None = None
@@ -84,13 +98,17 @@ class Problem:
     def step(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> Unknowns:
         """The most probable offset from here, to first order. It also finds the next strength of the bend prior."""
         found = self._equations(scheme, control, seen)
-        factor = factorise(self._matrix(found.data + found.prior, self._hold))
+        held = factorise(self._matrix(found.data + found.prior, self._hold))
         step = np.zeros(self.elements.n)
-        step[self.is_free] = -factor.solve(found.gradient[self.is_free])
+        step[self.is_free] = -held.solve(found.gradient[self.is_free])
+        # What is held says nothing of what the scan determines.
+        loose = (
+            factorise(self._matrix(found.data + found.prior, self.loose)) if np.any(self._hold > self.loose) else held
+        )
         self._hold_what_turns_back(step)
-        self._count_determined(found.data, factor)
+        self._count_determined(found.data, loose)
         if self._priors.bend is None:
-            self._find_bend(found, step, factor)
+            self._find_bend(found, step, loose)
         else:
             self._set_bend(self._precision * _SOFTER)
         return to_unknowns(jnp.asarray(step), self._zero)
@@ -102,7 +120,7 @@ class Problem:
 
     def _equations(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> _Equations:
         start = self.start(scheme, control)
-        face = control_face(self._topology, np.asarray(seen.at.face))
+        face = self._owner[np.asarray(seen.at.face)]
         if self._elements is None:
             self._elements = self._analyse(start, seen, face)
         elements, faces = self._elements, self._faces
@@ -143,7 +161,8 @@ class Problem:
     def start(self, scheme: js.AbstractScheme, control: js.Control) -> Start:
         """The arguments of the residuals, for a sweep that starts here."""
         template = _moved_to(self._template, np.asarray(control.vertices, np.float64))
-        return Start(scheme, self._topology, control, jnp.asarray(template, control.vertices.dtype), self._anchors)
+        template = jnp.asarray(template, control.vertices.dtype)
+        return Start(scheme, self._topology, control, template, self._anchors, self._edges, self._bend_edges)
 
     def across(
         self, scheme: js.AbstractScheme, control: js.Control
@@ -155,13 +174,22 @@ class Problem:
         before = 0
         for size in (3, 4):
             corners = np.asarray(surface.faces[size])
-            face[corners] = control_face(self._topology, before + np.arange(len(corners)))[:, None]
+            face[corners] = self._owner[before : before + len(corners), None]
             before += len(corners)
         itself = jnp.tile(jnp.eye(1, 4, dtype=surface.vertices.dtype), (n, 1))
         pairs = Pairs(surface.vertices, jnp.repeat(jnp.arange(n)[:, None], 4, axis=1), itself, surface.normals)
         start = self.start(scheme, control)
         parts = [self._differentiate(start, part, at)[1][: len(at)] for part, _, at in padded(pairs, np.ones(n), face)]
         return face, np.concatenate(parts)[:n]
+
+    def across_control(self, control: js.Control) -> tuple[Int[np.ndarray, "v 3"], Float[np.ndarray, "v 3"]]:
+        """How the control vertices move along their normals: the unknowns of each, and the derivatives."""
+        n = len(self._template)
+        normals = np.asarray(unit(control.normals))
+        if self._zero.vertices is None:
+            return np.full((n, 3), self.elements.n), normals
+        width = 3 + (0 if self._zero.normals is None else 2)
+        return width * np.arange(n)[:, None] + np.arange(3), normals
 
     def _find_bend(self, found: _Equations, step: Float[np.ndarray, "n"], factor: SuperLU) -> None:
         by = jacobian(self.elements, found.by_bend, self._faces.bend)[:, self.is_free]

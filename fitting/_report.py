@@ -17,7 +17,7 @@ class Report:
         noise: standard deviation of the Gaussian part of the distances.
         inlier_share: share of the points within three times the noise.
         rms_inliers: root mean square distance of these.
-        h: fitted tangent length coefficient, one or one a level.
+        h: fitted tangent length coefficient, one or one a level; None where the scheme has none.
         rms_per_sweep: at the start, then after every sweep.
     """
 
@@ -37,12 +37,12 @@ class Report:
     rms_inliers: float
     n_control_vertices: int
     n_faces: int
-    h: float | list[float]
+    h: float | list[float] | None
     rms_per_sweep: list[float]
 
     def __str__(self) -> str:
         state = f"converged after {self.sweeps} sweeps" if self.converged else f"NOT CONVERGED: {self.reason}"
-        h = ", ".join(f"{value:.4f}" for value in (self.h if isinstance(self.h, list) else [self.h]))
+        h = [] if self.h is None else self.h if isinstance(self.h, list) else [self.h]
         rows = [
             ("fit", state),
             ("RMS distance", f"{self.rms:.3f} mm (from {self.rms_start:.3f} mm)"),
@@ -53,8 +53,9 @@ class Report:
             ("RMS of these", f"{self.rms_inliers:.3f} mm"),
             ("control vertices", f"{self.n_control_vertices:,}"),
             ("faces of the surface", f"{self.n_faces:,}"),
-            ("tangent length h", h),
         ]
+        if h:
+            rows.append(("tangent length h", ", ".join(f"{value:.4f}" for value in h)))
         if self.rms > self.rms_start:
             rows.append(("note", "worse than the start: is the control mesh too coarse, or fairness too strong?"))
         width = max(len(name) for name, _ in rows)

@@ -11,9 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.spatial import KDTree
 
 import jaxsubdiv as js
 from jaxsubdiv._control import strong_float
+from jaxsubdiv._half_edges import half_edges
 from jaxsubdiv._linalg import cross, dot, norm, take, unit
 from jaxsubdiv._surface import sum_corners
 
@@ -86,6 +88,10 @@ class Start(NamedTuple):
     template: Float[Array, "v 3"]
     """Control vertices of the template, moved to `control` as a whole: what edges are compared with."""
     anchors: Anchors | None
+    edges: Int[Array | np.ndarray, "e 2"]
+    """Control edges."""
+    bend_edges: Int[Array | np.ndarray, "b 2"]
+    """Edges of which the bends are compared."""
 
 
 class Rows(NamedTuple):
@@ -112,35 +118,60 @@ def residuals(offset: Unknowns, start: Start, pairs: Pairs) -> Rows:
     none = jnp.zeros((0,), dtype)
     return Rows(
         distance=dot(pairs.directions, away)[:, 0],
-        bend=bend_asymmetry(start.topology, surface),
+        bend=_bends(start, scheme, control, surface),
         stretch=_stretch(start, control),
-        margin=_margin_rows(start.topology, control),
+        margin=_margin_rows(start.topology, control) if scheme.uses_normals else none,
         landmark=none if start.anchors is None else _anchor_rows(start.anchors, surface),
         h=none if offset.h is None else jnp.atleast_1d(scheme.h).astype(dtype) - 1,
     )
 
 
-def bend_asymmetry(topology: js.Topology, surface: js.RefinedSurface) -> Float[Array, "b"]:
+def bend_asymmetry(
+    topology: js.Topology, surface: js.RefinedSurface, edges: Int[Array | np.ndarray, "b 2"] | None = None
+) -> Float[Array, "b"]:
     """By how much the surface bends more at one end of an edge than at the other, in mm, edge by edge.
 
     It is half of the height of each end over the tangent plane at the other, one less the other:
     (n_a + n_b) . (x_b - x_a) / 2. It vanishes on spheres, on cylinders and for every circular arc, so that it smooths
     without shrinking; and it ties normals to the geometry, for a normal that leans bends its edges unevenly.
 
-    Taken over the edges of the first level, or the control edges where there is one level only.
+    Args:
+        topology: tables of the surface.
+        surface: the surface, or a coarser mesh.
+        edges: default: those of the first level, or the control edges where there is one level only.
     """
-    a, b = bend_edges(topology).T
+    a, b = (bend_edges(topology) if edges is None else edges).T
     d = take(surface.vertices, b) - take(surface.vertices, a)
     return 0.5 * dot(take(surface.normals, a) + take(surface.normals, b), d)[:, 0]
 
 
-def bend_edges(topology: js.Topology) -> Int[Array, "b 2"]:
+def bend_edges(topology: js.Topology) -> Int[Array | np.ndarray, "b 2"]:
     """The edges whose bends are compared."""
-    return topology.levels[min(1, len(topology.levels) - 1)].edges
+    if len(topology.levels) == 1 or not splits_in_four(topology):
+        return control_edges(topology)
+    return topology.levels[1].edges
+
+
+def control_edges(topology: js.Topology) -> Int[np.ndarray, "e 2"]:
+    """Edges of the control mesh, each once."""
+    return half_edges({size: np.asarray(faces) for size, faces in topology.control_faces.items()}).edges
+
+
+def splits_in_four(topology: js.Topology) -> bool:
+    """Whether the descendants of a control face are the rows that the paper's split gives them."""
+    n = 4 ** len(topology.levels)
+    return all(len(topology.faces[size]) == n * len(faces) for size, faces in topology.control_faces.items())
+
+
+def _bends(start: Start, scheme: js.AbstractScheme, control: js.Control, surface: js.RefinedSurface) -> Array:
+    if not scheme.is_primal:  # the surface has no vertices of the control mesh
+        normals = js.estimate_normals(start.topology.control_fans, control.vertices)
+        surface = js.RefinedSurface(control.vertices, normals, start.topology.control_faces)
+    return bend_asymmetry(start.topology, surface, start.bend_edges)
 
 
 def _stretch(start: Start, control: js.Control) -> Float[Array, "s"]:
-    a, b = start.topology.levels[0].edges.T
+    a, b = start.edges.T
 
     def along(rows: Float[Array, "v 3"]) -> Float[Array, "e 3"]:
         return take(rows, b) - take(rows, a)
@@ -180,28 +211,44 @@ class RowFaces(NamedTuple):
     h: Int[np.ndarray, "n"]
 
 
-def prior_faces(topology: js.Topology, anchors: Anchors | None, n_h: int) -> RowFaces:
-    """The faces of all rows but the distances'."""
+def prior_faces(
+    scheme: js.AbstractScheme, topology: js.Topology, anchors: Anchors | None, owner: Int[np.ndarray, "g"], n_h: int
+) -> RowFaces:
+    """The faces of all rows but the distances'.
+
+    Args:
+        owner: the control face of every face of the surface.
+    """
     triangles, quads = (np.asarray(topology.control_faces[size]) for size in (3, 4))
-    of_edge = _faces_of_edges(np.asarray(topology.levels[0].edges), triangles, quads)
-    # As `build_topology` lays out the edges of a level: halves of the parents', three in each triangle, four in a quad.
-    inner = (np.repeat(np.arange(len(triangles)), 3), np.repeat(len(triangles) + np.arange(len(quads)), 4))
-    finer = np.concatenate([np.repeat(of_edge, 2), *inner])
+    of_edge = _faces_of_edges(control_edges(topology), triangles, quads)
+    bends = of_edge
+    if len(bend_edges(topology)) != len(of_edge):
+        # As `build_topology` lays them out: halves of the parents' edges, three in a triangle, four in a quad.
+        inner = (np.repeat(np.arange(len(triangles)), 3), np.repeat(len(triangles) + np.arange(len(quads)), 4))
+        of_parent = _faces_of_edges(np.asarray(topology.levels[0].edges), triangles, quads)
+        bends = np.concatenate([np.repeat(of_parent, 2), *inner])
     corners = [np.tile(np.arange(len(triangles)), 3), np.tile(len(triangles) + np.arange(len(quads)), 4)]
-    at = np.zeros(0, int) if anchors is None else control_face(topology, np.asarray(anchors.face))
     return RowFaces(
         distance=np.zeros(0, int),
-        bend=of_edge if len(topology.levels) == 1 else finer,
+        bend=bends,
         stretch=np.repeat(of_edge, 3),
-        margin=np.concatenate(corners),
-        landmark=np.repeat(at, 3),
+        margin=np.concatenate(corners) if scheme.uses_normals else np.zeros(0, int),
+        landmark=np.zeros(0, int) if anchors is None else np.repeat(owner[np.asarray(anchors.face)], 3),
         h=np.zeros(n_h, int),
     )
 
 
-def control_face(topology: js.Topology, face: Int[np.ndarray, "p"]) -> Int[np.ndarray, "p"]:
-    """The control face that a face of the last level descends from."""
-    return face // 4 ** len(topology.levels)
+def control_faces_of(topology: js.Topology, surface: js.RefinedSurface, control: js.Control) -> Int[np.ndarray, "g"]:
+    """The control face that every face of the surface descends from; where the split keeps no order, the nearest."""
+    triangles, quads = (len(topology.control_faces[size]) for size in (3, 4))
+    if splits_in_four(topology):
+        return np.arange((triangles + quads) * 4 ** len(topology.levels)) // 4 ** len(topology.levels)
+
+    def centres(vertices: Array, faces: dict) -> Float[np.ndarray, "f 3"]:
+        return np.concatenate([np.asarray(vertices)[np.asarray(faces[size])].mean(axis=1) for size in (3, 4)])
+
+    tree = KDTree(centres(control.vertices, topology.control_faces))
+    return np.asarray(tree.query(centres(surface.vertices, surface.faces))[1])
 
 
 def _faces_of_edges(

@@ -107,7 +107,7 @@ class FitResult:
             rms_inliers=_rms(self.distances[self.inliers]),
             n_control_vertices=self.control.vertices.shape[0],
             n_faces=self.surface.n_faces,
-            h=np.asarray(self.scheme.h).tolist(),
+            h=None if self.scheme.h is None else np.asarray(self.scheme.h).tolist(),
             rms_per_sweep=[float(value) for value in self.rms],
         )
 
