@@ -7,6 +7,9 @@ from ._correspondence import closest_points as closest_points
 from ._example import example as example
 from ._fit import Sweep as Sweep
 from ._fit import fit as fit
+from ._fit_scan import ScanFit as ScanFit
+from ._fit_scan import fit_scan as fit_scan
+from ._fit_scan import misfit as misfit
 from ._free import Free as Free
 from ._landmarks import Landmarks as Landmarks
 from ._landmarks import match_landmarks as match_landmarks

@@ -1,96 +1,187 @@
-"""Fit a control mesh to a scan: `python -m fitting SCAN --control MESH -o OUT`; without arguments, an example."""
+"""Fit scans: `python -m fitting SCAN... [--control MESH] -o OUT`; without arguments, an example."""
 
 import argparse
+import csv
+import io
 import os
 import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import jax
 import numpy as np
 import optimistix as optx
 
 import jaxsubdiv as js
+from jaxsubdiv._compare import SCHEMES
 from jaxsubdiv._files import replacing
 from jaxsubdiv._warnings import plain_warnings
 
 from ._example import Example, example
-from ._fit import Sweep, fit
+from ._fit import Sweep
+from ._fit_scan import ScanFit, fit_scan, misfit
+from ._landmarks import Landmarks, match_landmarks, read_landmarks
 from ._picture import draw_fit, surface_distances
-from ._result import FitResult
 from ._scan import Scan, read_scan
 
 _EXAMPLE_NOISE = 3.0  # mm: the example starts from a control mesh that is wrong, to show that the fit mends it
-_SCHEMES = {"interpolating": js.Interpolating, "circle": js.CirclePreserving}
+_SCAN_FILES = {".ply", ".xyz", ".csv", ".txt", ".npz", ".vtp", ".vtk", ".stl", ".obj", ".off", ".gii"}
+_SUMMARY = (
+    "scan",
+    "status",
+    "seconds",
+    "points",
+    "rms_mm",
+    "percentile_95_mm",
+    "noise_mm",
+    "misfit_mm",
+    "inlier_share",
+)
+
+
+class _Job(NamedTuple):
+    """One scan to fit."""
+
+    name: str
+    scan: Scan
+    mesh: js.ControlMesh | None
+    landmarks: Landmarks | None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; exit status 0, 1 where the fit did not converge, 2 where the input cannot be used."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
-    if (options.scan is None) != (options.control is None):
-        parser.error(
-            "a scan needs a control mesh to start from, and a control mesh a scan: give SCAN and --control MESH"
-        )
+    """The command line; exit status 0, 1 where a fit did not converge, 2 where an input cannot be used."""
+    options = _parser().parse_args(arguments)
     _keep_compiled_programs()
-    try:
-        with plain_warnings():
-            return _run(options)
-    except (js.MeshError, ValueError, OSError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    with plain_warnings():
+        try:
+            scans = _scan_files([Path(scan) for scan in options.scans])
+        except ValueError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 2
+        if len(scans) > 1:
+            return _run_all(scans, options)
+        scan = scans[0] if scans else None
+        folder = Path(options.output or f"fit_{scan.stem if scan else options.example}")
+        return _run(scan, folder, options)["status"]
 
 
-def _run(options: argparse.Namespace) -> int:
-    folder = Path(options.output or f"fit_{Path(options.scan).stem if options.scan else options.example}")
-    scan, mesh, name = _inputs(options)
-    print(f"scan     {scan.n_points:,} points, {_size(np.asarray(scan.points))}")
-    print(f"control  {len(mesh.vertices):,} vertices, {mesh.n_faces:,} faces, {_size(mesh.vertices)}")
-    scheme = _SCHEMES[options.scheme](options.h)
-    topology = js.build_topology(mesh, scheme, options.levels)
-    print("fitting  the first sweep compiles the program, which takes seconds once and is kept for the next run")
+def _run_all(scans: list[Path], options: argparse.Namespace) -> int:
+    """Every scan into a folder of its own, going on after a failure, and a table of all."""
+    parent = Path(options.output or "fits")
+    rows = []
+    for number, scan in enumerate(scans, 1):
+        print(f"\n[{number}/{len(scans)}] {scan}")
+        rows.append(_run(scan, parent / _unique_name(scan, scans), options))
+    parent.mkdir(parents=True, exist_ok=True)
+    table = io.StringIO()
+    writer = csv.DictWriter(table, _SUMMARY, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    with replacing(parent / "summary.csv") as path:
+        path.write_text(table.getvalue(), encoding="utf-8")
+    print(f"\n{table.getvalue()}\nwrote    {parent / 'summary.csv'}")
+    failed = [row["scan"] for row in rows if row["status"]]
+    if failed:
+        print(f"{len(failed)} of {len(rows)} did not end well: {', '.join(failed)}", file=sys.stderr)
+    return max(row["status"] for row in rows)
+
+
+def _run(scan: Path | None, folder: Path, options: argparse.Namespace) -> dict:
+    """One fit: its row of the summary, whose status is 0, 1 for one that did not converge, 2 for one that failed."""
+    name = scan.name if scan else options.example
     began = time.perf_counter()
-    with _Progress(options.max_sweeps) as progress:
-        result = fit(
-            scheme,
-            topology,
-            mesh.control(weights=scheme.weights),
-            scan,
-            max_sweeps=options.max_sweeps,
-            throw=False,
-            on_sweep=progress.update,
+    try:
+        job = _inputs(scan, options)
+        print(f"scan     {job.scan.n_points:,} points, {_size(np.asarray(job.scan.points))}")
+        if job.mesh is not None:
+            print(
+                f"control  {len(job.mesh.vertices):,} vertices, {job.mesh.n_faces:,} faces, {_size(job.mesh.vertices)}"
+            )
+        scheme = SCHEMES[options.scheme](**({} if options.h is None else {"h": options.h}))
+        with _Progress(options.max_sweeps) as progress:
+            found = fit_scan(
+                job.scan,
+                job.mesh,
+                scheme=scheme,
+                levels=options.levels,
+                faces=options.faces,
+                kind=options.kind,
+                closed=options.closed,
+                pose=None if options.align == "none" else options.align,
+                landmarks=job.landmarks,
+                tolerance_mm=options.tolerance,
+                on_stage=progress.stage,
+                max_sweeps=options.max_sweeps,
+                throw=False,
+                on_sweep=progress.update,
+            )
+        seconds = time.perf_counter() - began
+        report, off = found.result.report(), misfit(found.result)
+        print(f"done     in {seconds:.1f} s{_ending(found, off)}\n\n{report}\n")
+        _save(folder, found, name)
+    except (js.MeshError, ValueError, TypeError, OSError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return {"scan": name, "status": 2, "seconds": f"{time.perf_counter() - began:.1f}"}
+    return {
+        "scan": name,
+        "status": 0 if found.result.result == optx.RESULTS.successful else 1,
+        "seconds": f"{seconds:.1f}",
+        "points": report.n_points,
+        "rms_mm": f"{report.rms:.4f}",
+        "percentile_95_mm": f"{report.percentile_95:.4f}",
+        "noise_mm": f"{report.noise:.4f}",
+        "misfit_mm": f"{off:.4f}",
+        "inlier_share": f"{report.inlier_share:.4f}",
+    }
+
+
+def _inputs(scan: Path | None, options: argparse.Namespace) -> _Job:
+    if scan is None:
+        print(
+            f"example  {options.example}, its control vertices moved by noise of {_EXAMPLE_NOISE:g} mm in each "
+            "coordinate"
         )
-    print(f"done     in {time.perf_counter() - began:.1f} s\n\n{result.report()}\n")
-    _save(folder, result, mesh, name)
-    return 0 if result.result == optx.RESULTS.successful else 1
+        points, mesh = example(options.example)
+        noise = np.random.default_rng(0).normal(scale=_EXAMPLE_NOISE, size=mesh.vertices.shape)
+        return _Job(options.example, points, js.ControlMesh(mesh.vertices + noise, mesh.faces, mesh.normals), None)
+    points = read_scan(scan, scale=options.scale, label=options.label)
+    mesh = None if options.control is None else js.read_mesh(options.control, scale=options.control_scale)
+    landmarks = None
+    if (options.landmarks is None) != (options.control_landmarks is None) or (options.landmarks and mesh is None):
+        raise ValueError(
+            "landmarks are places on both sides: give --landmarks FILE for the scan, --control-landmarks FILE for the "
+            "control mesh, and --control MESH."
+        )
+    if options.landmarks is not None:
+        landmarks = match_landmarks(
+            read_landmarks(options.landmarks, scale=options.scale),
+            read_landmarks(options.control_landmarks, scale=options.control_scale),
+        )
+    return _Job(scan.name, points, mesh, landmarks)
 
 
-def _inputs(options: argparse.Namespace) -> tuple[Scan, js.ControlMesh, str]:
-    if options.scan is not None:
-        mesh = js.read_mesh(options.control, scale=options.control_scale)
-        return read_scan(options.scan, scale=options.scale), mesh, Path(options.scan).name
-    print(
-        f"example  {options.example}, its control vertices moved by noise of {_EXAMPLE_NOISE:g} mm in each coordinate"
-    )
-    scan, mesh = example(options.example)
-    noise = np.random.default_rng(0).normal(scale=_EXAMPLE_NOISE, size=mesh.vertices.shape)
-    return scan, js.ControlMesh(mesh.vertices + noise, mesh.faces, mesh.normals), options.example
+def _ending(found: ScanFit, off: float) -> str:
+    if found.outcome is None:
+        return ""
+    return f"; split {found.splits} times, {found.outcome}: the surface is {off:.3f} mm off the scan beside the noise"
 
 
-def _save(folder: Path, result: FitResult, start: js.ControlMesh, name: str) -> None:
+def _save(folder: Path, found: ScanFit, name: str) -> None:
     """The fit as files, each complete or not there at all."""
+    result = found.result
     folder.mkdir(parents=True, exist_ok=True)
-    fitted = js.ControlMesh(result.control.vertices, start.faces, result.control.normals, check=False)
+    fitted = js.ControlMesh(result.control.vertices, found.start.faces, result.control.normals, check=False)
     js.write_mesh(folder / "control.obj", fitted)
-    js.write_mesh(folder / "surface.ply", result.surface, vertex_data={"distance_mm": surface_distances(result)})
+    values = {"distance_mm": surface_distances(result), "deviation_mm": result.uncertainty().surface}
+    js.write_mesh(folder / "surface.ply", result.surface, vertex_data=values)
     with replacing(folder / "report.json") as path:
         path.write_text(result.report().as_json() + "\n", encoding="utf-8")
     written = ["control.obj", "surface.ply", "report.json"]
     try:
         with replacing(folder / "fit.png") as path:
-            draw_fit(result, start, title=name).savefig(path)
+            draw_fit(result, found.start, title=name).savefig(path)
         written.append("fit.png")
     except ImportError as error:
         print(f"note     no picture: {error}")
@@ -117,8 +208,20 @@ class _Progress:
             self._bar.close()
 
     @property
+    def stage(self) -> Callable[[str], None]:
+        return self._stage
+
+    @property
     def update(self) -> Callable[[Sweep], None]:
         return self._update
+
+    def _stage(self, words: str) -> None:
+        text = f"now      {words}"
+        if self._bar is None:
+            print(text)
+        else:
+            self._bar.reset()
+            self._bar.write(text)
 
     def _update(self, sweep: Sweep) -> None:
         if self._bar is None:
@@ -126,6 +229,25 @@ class _Progress:
         else:
             self._bar.set_postfix_str(f"RMS {sweep.rms:.3f} mm")
             self._bar.update()
+
+
+def _scan_files(given: list[Path]) -> list[Path]:
+    """The files named, and those in the folders named, in order of their names."""
+    scans = []
+    for path in given:
+        if not path.is_dir():
+            scans.append(path)
+            continue
+        inside = sorted(file for file in path.iterdir() if file.suffix.lower() in _SCAN_FILES)
+        if not inside:
+            raise ValueError(f"the folder {path} holds no scan: {', '.join(sorted(_SCAN_FILES))}.")
+        scans += inside
+    return scans
+
+
+def _unique_name(scan: Path, scans: list[Path]) -> str:
+    """The file's name without its suffix, or with it where two files share the rest."""
+    return scan.stem if [other.stem for other in scans].count(scan.stem) == 1 else scan.name
 
 
 def _size(points: np.ndarray) -> str:
@@ -144,24 +266,32 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="jaxsubdiv-fit",
         description="Fit a control mesh, with its normals and h, to a scan, so that its smooth subdivision surface is "
-        "the anatomy. Without SCAN it runs an example that ships with the package.",
+        "the anatomy. The control mesh is aligned with the scan first, or made from it where none is given. Without "
+        "SCAN it runs an example that ships with the package.",
         epilog="OUT gets control.obj (fitted control mesh with normals), surface.ply (refined surface, with the signed "
-        "distance of the scan in mm at every vertex), report.json and fit.png. Scan and control mesh must be roughly "
-        "aligned, and both in mm. Exit status: 0 converged, 1 not converged (files are written all the same), 2 the "
-        "input cannot be used.",
+        "distance of the scan and the standard deviation of the surface in mm at every vertex), report.json and "
+        "fit.png; of several scans, a folder each and summary.csv. Lengths are in mm. Exit status: 0 converged, 1 not "
+        "converged (files are written all the same), 2 an input cannot be used.",
     )
-    parser.add_argument("scan", nargs="?", metavar="SCAN", help="points: .ply .xyz .csv .txt .npz .vtp, or a mesh file")
-    parser.add_argument("--control", metavar="MESH", help="control mesh of triangles and quads to start from")
-    parser.add_argument(
-        "-o", "--output", metavar="OUT", help="folder for the results (default: fit_ and the scan's name)"
-    )
-    parser.add_argument("--scale", type=float, default=1.0, help="multiplies the scan's coordinates; 1000 for metres")
-    parser.add_argument("--control-scale", type=float, default=1.0, help="multiplies the control mesh's coordinates")
-    parser.add_argument("--levels", type=int, default=3, help="levels of refinement, 1 to 8 (default: 3)")
-    parser.add_argument("--scheme", choices=tuple(_SCHEMES), default="interpolating", help="default: interpolating")
-    parser.add_argument("--h", type=float, default=1.0, help="tangent length coefficient at the start (default: 1)")
-    parser.add_argument("--max-sweeps", type=int, default=60, help="pairing and solving in turns (default: 60)")
-    parser.add_argument("--example", choices=get_args(Example), default="head_fragment", help="which, without SCAN")
+    add = parser.add_argument
+    add("scans", nargs="*", metavar="SCAN", help="points or meshes, or folders of them: .ply .xyz .csv .txt .npz .vtp")
+    add("--control", metavar="MESH", help="template of triangles and quads to start from; default: made from the scan")
+    add("-o", "--output", metavar="OUT", help="folder for the results (default: fit_ and the scan's name, or fits)")
+    add("--faces", type=int, default=500, help="of the control mesh, where it is made (default: 500)")
+    add("--kind", choices=("triangle", "quad"), default="triangle", help="of these faces (default: triangle)")
+    add("--closed", action=argparse.BooleanOptionalAction, help="whether the anatomy is; default: found from the scan")
+    add("--align", choices=("similarity", "rigid", "affine", "none"), default="similarity", help="of the template")
+    add("--landmarks", metavar="FILE", help="named places on the scan, .json or .csv; the template's in the next")
+    add("--control-landmarks", metavar="FILE", help="the same names on the template")
+    add("--tolerance", type=float, metavar="MM", help="split the control mesh until the surface is this near the scan")
+    add("--label", help="only the rows of a .csv whose column `label` or `contour` holds this")
+    add("--scale", type=float, default=1.0, help="multiplies the scan's coordinates; 1000 for metres")
+    add("--control-scale", type=float, default=1.0, help="multiplies the control mesh's coordinates")
+    add("--levels", type=int, default=3, help="levels of refinement, 1 to 8 (default: 3)")
+    add("--scheme", choices=tuple(SCHEMES), default="interpolating", help="default: interpolating")
+    add("--h", type=float, help="tangent length coefficient at the start, for schemes that have one (default: 1)")
+    add("--max-sweeps", type=int, default=60, help="pairing and solving in turns (default: 60)")
+    add("--example", choices=get_args(Example), default="head_fragment", help="which, without SCAN")
     return parser
 
 

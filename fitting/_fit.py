@@ -13,12 +13,14 @@ from jaxtyping import Array, Float
 
 import jaxsubdiv as js
 from jaxsubdiv._linalg import dot, unit
+from jaxsubdiv._surface import corner_weights
 
-from ._correspondence import boundary_vertices
+from ._correspondence import boundary_vertices, closest_points
 from ._free import Free, apply_offset, edge_length
+from ._landmarks import Landmarks, place_landmarks
 from ._look import Look, look
 from ._problem import Problem
-from ._residuals import Priors
+from ._residuals import Anchors, Priors
 from ._result import FitResult
 from ._robust import AbstractLoss, geman_mcclure
 from ._scan import Scan, ScanError
@@ -54,6 +56,8 @@ def fit(
     free: Free | None = None,
     priors: Priors | None = None,
     loss: AbstractLoss | None = None,
+    landmarks: Landmarks | None = None,
+    landmark_deviation: float = 1.0,
     max_sweeps: int = 60,
     tolerance: float = 0.1,
     throw: bool = True,
@@ -75,6 +79,8 @@ def fit(
         free: what may move; default: all of `Free()`.
         priors: what is known of the surface beforehand; default: `Priors()`.
         loss: how a point loses weight with its distance; default: `geman_mcclure()`.
+        landmarks: places on the scan and on the control mesh where it starts, which the fit keeps together.
+        landmark_deviation: how far they may be apart, as a standard deviation in mm; a weight divides its square.
         max_sweeps: how many sweeps at most.
         tolerance: converged once a sweep, annealed, moves nine tenths of the surface, and the RMS distance, by less
             than this part of the surface's uncertainty, which is about noise / sqrt(points a control vertex); or of a
@@ -98,7 +104,8 @@ def fit(
     widest = float(seen.scale)  # a robust scale of the start's own error: outliers must not widen it
     _warn_if_far(float(np.median(np.abs(seen.distances))), control)
     rms, robust_rms, result = [float(seen.rms)], [float(seen.robust_rms)], optx.RESULTS.nonlinear_max_steps_reached
-    problem = Problem(scheme, topology, control, free, priors)
+    anchors = None if landmarks is None else _anchors(landmarks, landmark_deviation, topology, control, surface)
+    problem = Problem(scheme, topology, control, free, priors, anchors)
     for sweep in range(max_sweeps):
         proposed = _apply(topology, scheme, control, problem.step(scheme, control, seen))
         refined = js.refine(proposed[0], topology, proposed[1])
@@ -157,6 +164,24 @@ def _uncertainty(seen: Look, control: js.Control) -> float:
     """About how well the scan determines the surface, in mm."""
     counted = max(float(np.sum(np.asarray(seen.weights) > 0)), 1.0)
     return float(seen.scale) * (control.vertices.shape[0] / counted) ** 0.5
+
+
+def _anchors(
+    landmarks: Landmarks,
+    deviation: float,
+    topology: js.Topology,
+    control: js.Control,
+    surface: js.RefinedSurface,
+) -> Anchors:
+    """Landmarks at the places of the surface that are closest to theirs on the control mesh."""
+    placed = place_landmarks(landmarks, js.ControlMesh(control.vertices, topology.control_faces, check=False))
+    counted = placed.weights > 0
+    at = closest_points(surface, placed.mesh[counted])
+    corners, weights = corner_weights(surface, at)
+    dtype = control.vertices.dtype
+    points = jnp.asarray(placed.scan[counted], dtype)
+    deviations = jnp.asarray(deviation / np.sqrt(placed.weights[counted]), dtype)
+    return Anchors(points, at.face, corners, weights, deviations)
 
 
 def _given_normals(topology: js.Topology, control: js.Control) -> Float[Array, "v 3"]:

@@ -79,7 +79,9 @@ def _measure(
     corners, inside = corner_weights(surface, at)
     at_boundary = jnp.sum(jnp.where(open_vertices[corners], inside, 0.0), axis=1) > 1 - _ON_BOUNDARY
     if scan.normals is not None:
-        given = jnp.where(dot(unit(scan.normals), normals)[:, 0] < _LEAST_COSINE, 0.0, given)
+        cosine = dot(unit(scan.normals), normals)[:, 0]
+        # Files have normals of either side: the side that most points are on is outside.
+        given = jnp.where(cosine * jnp.sign(jnp.sum(cosine)) < _LEAST_COSINE, 0.0, given)
     # Beyond a boundary the distance runs along the surface, and says nothing of the noise across it.
     noise = noise_scale(distance / spread, jnp.where(at_boundary, 0.0, given))
     scale = jnp.maximum(noise, floor)

@@ -1,5 +1,6 @@
 """The scan: measured points, and what is known of each."""
 
+import csv
 from pathlib import Path
 
 import equinox as eqx
@@ -10,6 +11,8 @@ from jaxtyping import Array, Float
 import jaxsubdiv as js
 from jaxsubdiv._control import strong_float
 from jaxsubdiv._errors import name_rows
+
+_LABELS = ("label", "contour")
 
 
 class ScanError(ValueError):
@@ -86,15 +89,36 @@ class Scan(eqx.Module):
         return self.deviations / jnp.sqrt(jnp.mean(self.deviations**2))
 
 
-def read_scan(path: str | Path, *, scale: float = 1.0) -> Scan:
+def read_scan(path: str | Path, *, scale: float = 1.0, label: str | None = None) -> Scan:
     """A scan from a file of points: PLY, XYZ, CSV, TXT, NPZ, VTP, or any mesh file, whose vertices are then the points.
 
     Args:
         path: the file.
         scale: multiplies the coordinates. A file of points does not say its unit; 1000 takes metres to mm.
+        label: only the rows of a CSV file whose column `label` or `contour` holds this text, in capitals or not.
 
     Raises:
         MeshError: the file cannot be read; the text names the file and the line.
-        ScanError: it holds no points.
+        ScanError: it holds no points, or none of this label; the text lists the labels that there are.
     """
-    return Scan(*js.read_points(path, scale=scale))
+    cloud = js.read_points(path, scale=scale)
+    if label is None:
+        return Scan(*cloud)
+    labels = _labels(Path(path))
+    chosen = np.array([label.casefold() in one.casefold() for one in labels], bool)
+    if len(labels) != len(cloud.points) or not chosen.any():
+        there = ", ".join(sorted(set(labels))) or "no column `label` or `contour`"
+        raise ScanError(f"{Path(path).name}: no row has a label that holds '{label}'. It has: {there}.")
+    return Scan(*(None if rows is None else rows[chosen] for rows in cloud))
+
+
+def _labels(path: Path) -> list[str]:
+    """The label of every row of a CSV file with a header."""
+    lines = [
+        text
+        for line in path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+        if (text := line.partition("#")[0].strip())
+    ]
+    rows = csv.DictReader(lines, delimiter=";" if lines and ";" in lines[0] else ",")
+    name = next((name for name in rows.fieldnames or () if name.strip().lower() in _LABELS), None)
+    return [] if name is None else [(row[name] or "").strip() for row in rows]
