@@ -52,7 +52,10 @@ class _Job(NamedTuple):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; exit status 0, 1 where a fit did not converge, 2 where an input cannot be used."""
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.control and not options.scans:
+        parser.error("a control mesh needs a scan to be fitted to: give SCAN to --control")
     _keep_compiled_programs()
     with plain_warnings():
         try:

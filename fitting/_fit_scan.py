@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial import KDTree
 
 import jaxsubdiv as js
@@ -21,6 +22,7 @@ Outcome: TypeAlias = Literal["tolerance met", "noise reached", "no more faces"]
 
 # Misfit that is a smaller part of the noise than this does not show beside it.
 _LEAST_MISFIT = 0.15
+_SWELLINGS = 3
 
 
 class ScanFit(NamedTuple):
@@ -64,7 +66,8 @@ def fit_scan(
         pose: how the template may move to the scan before the fit, see `align`; None leaves it where it is.
         landmarks: places on scan and template, for the alignment and the fit; see `Landmarks`.
         tolerance_mm: split the control mesh by the scheme's own rule, and fit again, until the misfit (see `misfit`) is
-            this small, or too small to be told from the noise, or the next split would make too many faces.
+            this small, or too small to be told from the noise, or the next split would make too many faces for
+            `most_faces` or for two points a control vertex.
         most_faces: of the control mesh, where it is split.
         on_stage: told what begins, in a few words.
         options: of `fit`.
@@ -90,6 +93,8 @@ def fit_scan(
         # Tables come from the faces alone; normals that would fold the surface are replaced in the fit.
         topology = js.build_topology(js.ControlMesh(mesh.vertices, mesh.faces), scheme, levels)
         control = mesh.control(weights=scheme.weights)
+        if splits == 0 and not scheme.interpolates:
+            control = js.Control(_swollen(mesh, scheme), control.normals)
         result = fit(scheme, topology, control, scan, landmarks=landmarks, **options)
         outcome = _outcome(result, mesh, tolerance_mm, most_faces)
         if tolerance_mm is None or outcome is not None:
@@ -114,12 +119,17 @@ def misfit(result: FitResult) -> float:
 
 
 def _outcome(result: FitResult, mesh: js.ControlMesh, tolerance_mm: float | None, most_faces: int) -> Outcome | None:
+    if tolerance_mm is None:
+        return None
     off = misfit(result)
-    if tolerance_mm is None or off <= tolerance_mm:
-        return None if tolerance_mm is None else "tolerance met"
-    if off <= _LEAST_MISFIT * result.noise:
+    if off <= tolerance_mm:
+        return "tolerance met"
+    # Of few points the mean product is not 0 even where nothing is shared: two standard deviations of it.
+    by_chance = 2 * result.noise**2 / result.inliers.sum() ** 0.5
+    if off**2 <= (_LEAST_MISFIT * result.noise) ** 2 + by_chance:
         return "noise reached"
-    return "no more faces" if 4 * mesh.n_faces > most_faces else None
+    too_many = 4 * mesh.n_faces > most_faces or 8 * len(mesh.vertices) > result.scan.n_points
+    return "no more faces" if too_many else None
 
 
 def _split(result: FitResult, mesh: js.ControlMesh) -> js.ControlMesh:
@@ -130,6 +140,16 @@ def _split(result: FitResult, mesh: js.ControlMesh) -> js.ControlMesh:
     fitted = js.ControlMesh(result.control.vertices, mesh.faces, result.control.normals, check=False)
     finer = js.refine(scheme, js.build_topology(fitted, scheme, 1), result.control)
     return js.ControlMesh(finer.vertices, finer.faces, finer.normals if scheme.uses_normals else None)
+
+
+def _swollen(mesh: js.ControlMesh, scheme: js.AbstractScheme) -> Float[np.ndarray, "v 3"]:
+    """Control vertices whose limit surface, which shrinks from them, goes nearly through those of the mesh."""
+    bare = js.ControlMesh(mesh.vertices, mesh.faces)
+    limit = js.stencils(scheme, js.build_topology(bare, scheme, 0, limit=True))[: len(mesh.vertices)]
+    vertices = mesh.vertices
+    for _ in range(_SWELLINGS):  # not to the end: that would swell noise most of all
+        vertices = vertices + (mesh.vertices - limit @ vertices)
+    return vertices
 
 
 def moved(landmarks: Landmarks, mesh: js.ControlMesh, alignment: Alignment) -> Landmarks:

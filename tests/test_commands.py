@@ -1,5 +1,6 @@
 """Both command lines, run in this process: what they write and print, and what they refuse."""
 
+import csv
 import json
 import subprocess
 import sys
@@ -130,7 +131,7 @@ def test_warnings_are_plain_words_on_stderr(tmp_path, pyramid, capsys):
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         assert run(refine, pyramid, tmp_path / "out.stl", "--levels", 0) == 0
-    assert capsys.readouterr().err == (
+    assert capsys.readouterr().err.endswith(  # the mesh's normals are warned of too
         "warning: out.stl: STL holds triangles only: 1 quads were split in two along their first diagonal.\n"
     )
 
@@ -205,14 +206,19 @@ def files(tmp_path, monkeypatch) -> Path:
 RESULTS = ["control.obj", "fit.png", "report.json", "surface.ply"]
 
 
+GIVEN = ("--control", "control.obj", "--levels", 1, "--align", "none")
+"""A control mesh where it is, and one level: what the fits of `scans` run."""
+
+
 def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
 def test_fit_of_files_is_that_of_the_library(files, capsys):
-    assert run(fit, "scan.xyz", "--control", "control.obj", "--levels", 1, "-o", "deep/folder") == 0
+    assert run(fit, "scan.xyz", *GIVEN, "-o", "deep/folder") == 0
     found, out = problem().fit(problem().points + noise()), capsys.readouterr().out
     assert "scan     600 points, " in out and "control  12 vertices, 14 faces, " in out
+    assert "now      fits 12 control vertices" in out
     assert (
         str(found.report()) in out and "wrote    control.obj, surface.ply, report.json, fit.png in deep/folder" in out
     )
@@ -236,45 +242,131 @@ def test_fit_of_files_is_that_of_the_library(files, capsys):
 def test_options_of_a_fit_reach_it(files, monkeypatch, options, scheme, levels, max_sweeps):
     seen = []
 
-    def told(scheme, topology, control, scan, **how):
-        seen.append((scheme, len(topology.levels), how["max_sweeps"]))
+    def told(scan, mesh, *, scheme, levels, max_sweeps, **how):
+        seen.append((scheme, levels, max_sweeps))
         raise ValueError("seen enough")
 
-    monkeypatch.setattr("fitting.__main__.fit", told)
+    monkeypatch.setattr("fitting.__main__.fit_scan", told)
     assert run(fit, "scan.xyz", "--control", "control.obj", *options.split()) == 2
     [(found, *numbers)] = seen
     assert type(found) is type(scheme) and found.h == scheme.h and numbers == [levels, max_sweeps]
 
 
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ("", {"pose": "similarity", "tolerance_mm": None, "faces": 500, "kind": "triangle", "closed": None}),
+        ("--align rigid --tolerance 0.3", {"pose": "rigid", "tolerance_mm": 0.3}),
+        (
+            "--align none --faces 80 --kind quad --no-closed",
+            {"pose": None, "faces": 80, "kind": "quad", "closed": False},
+        ),
+        ("--closed", {"closed": True}),
+    ],
+)
+def test_options_of_a_start_reach_it(files, monkeypatch, options, expected):
+    seen = []
+
+    def told(scan, mesh, **how):
+        seen.append(how)
+        raise ValueError("seen enough")
+
+    monkeypatch.setattr("fitting.__main__.fit_scan", told)
+    assert run(fit, "scan.xyz", "--control", "control.obj", *options.split()) == 2
+    assert {name: seen[0][name] for name in expected} == expected
+
+
+def test_many_scans_get_a_folder_each_and_a_summary_though_one_fails(files, capsys):
+    folder = files / "scans"
+    folder.mkdir()
+    np.savetxt(folder / "first.xyz", problem().points + noise())
+    (folder / "second.csv").write_text("x,y,z\n1,2\n")
+    (folder / "notes.md").write_text("no scan")
+    np.savetxt(folder / "third.xyz", problem().points + noise(1))
+    assert run(fit, "scans", *GIVEN, "-o", "out") == 2
+    captured = capsys.readouterr()
+    assert "second.csv, line 2" in captured.err and "1 of 3 did not end well: second.csv" in captured.err
+    assert names(files / "out") == ["first", "summary.csv", "third"] and names(files / "out" / "first") == RESULTS
+    rows = list(csv.DictReader((files / "out" / "summary.csv").read_text().splitlines()))
+    assert [(row["scan"], row["status"]) for row in rows] == [
+        ("first.xyz", "0"),
+        ("second.csv", "2"),
+        ("third.xyz", "0"),
+    ]
+    own = json.loads((files / "out" / "third" / "report.json").read_text())
+    np.testing.assert_allclose(float(rows[2]["rms_mm"]), own["rms"], atol=6e-5)
+    assert rows[1]["rms_mm"] == ""
+
+
+def test_scans_of_one_name_keep_their_suffix(files):
+    np.savetxt("scan.csv", problem().points + noise(), delimiter=",")
+    assert run(fit, "scan.xyz", "scan.csv", *GIVEN, "--max-sweeps", 0, "-o", "out") == 1
+    assert names(files / "out") == ["scan.csv", "scan.xyz", "summary.csv"]
+
+
+def test_rows_of_one_label_are_fitted_alone(files, capsys):
+    points = problem().points + noise()
+    rows = [f"{x},{y},{z},{'Left inside' if i % 2 else 'valve'}" for i, (x, y, z) in enumerate(points)]
+    Path("heart.csv").write_text("\n".join(["x,y,z,contour", *rows]))
+    assert run(fit, "heart.csv", *GIVEN, "--label", "left", "--max-sweeps", 0, "-o", "out") == 1
+    assert "scan     300 points, " in capsys.readouterr().out
+    assert run(fit, "heart.csv", *GIVEN, "--label", "right", "-o", "out") == 2
+    assert "no row has a label that holds 'right'. It has: Left inside, valve." in capsys.readouterr().err
+
+
+def test_landmarks_of_both_sides_are_kept_together(files, capsys):
+    p = problem()
+    at = np.asarray(p.truth.vertices)
+    mesh = {name: at[i].tolist() for i, name in enumerate(["top", "left", "front", "back"])}
+    scan = {name: (np.asarray(place) + (0.0, 0.0, 2.0)).tolist() for name, place in mesh.items()}
+    Path("scan.json").write_text(json.dumps(scan))
+    Path("mesh.json").write_text(json.dumps(mesh))
+    both = ("--landmarks", "scan.json", "--control-landmarks", "mesh.json")
+    assert run(fit, "scan.xyz", *GIVEN, *both, "--max-sweeps", 8, "-o", "with") in (0, 1)
+    assert run(fit, "scan.xyz", *GIVEN, "--max-sweeps", 8, "-o", "without") in (0, 1)
+    z_with, z_without = (js.read_mesh(f"{folder}/control.obj").vertices[:4, 2] for folder in ("with", "without"))
+    assert np.mean(z_with - z_without) > 0.08
+    capsys.readouterr()
+    assert run(fit, "scan.xyz", *GIVEN, *both[:2]) == 2
+    assert "landmarks are places on both sides" in capsys.readouterr().err
+
+
 def test_fit_that_did_not_converge_is_status_1_and_written_all_the_same(files, capsys):
-    assert run(fit, "scan.xyz", "--control", "control.obj", "--levels", 1, "--max-sweeps", 2) == 1
+    assert run(fit, "scan.xyz", *GIVEN, "--max-sweeps", 2) == 1
     assert "NOT CONVERGED" in capsys.readouterr().out
     assert names(files / "fit_scan") == RESULTS
     assert json.loads((files / "fit_scan" / "report.json").read_text())["converged"] is False
 
 
 def test_scales_bring_both_files_to_mm(files):
-    options = ("--levels", 1, "--max-sweeps", 0)  # the start itself: a sweep's solver lets the last digits grow
+    options = (
+        "--levels",
+        1,
+        "--align",
+        "none",
+        "--max-sweeps",
+        0,
+    )  # the start itself: a sweep's solver lets the last digits grow
     assert run(fit, "scan.xyz", "--control", "control.obj", "-o", "a", *options) == 1
     scaled = ("metres.xyz", "--scale", 1000, "--control", "centimetres.obj", "--control-scale", 10)
     assert run(fit, *scaled, "-o", "b", *options) == 1
     a, b = (js.read_mesh(f"{folder}/control.obj").vertices for folder in "ab")
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-9)
     a, b = (json.loads(Path(folder, "report.json").read_text())["rms"] for folder in "ab")
-    np.testing.assert_allclose(a, b, rtol=1e-9)
+    np.testing.assert_allclose(a, b, rtol=1e-4)  # rounding decides between two bent quads that are equally near
 
 
 def test_without_matplotlib_there_is_no_picture_but_all_the_rest(files, capsys, monkeypatch):
     for module in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, module, None)
-    assert run(fit, "scan.xyz", "--control", "control.obj", "--levels", 1, "--max-sweeps", 1, "-o", "out") == 1
+    assert run(fit, "scan.xyz", *GIVEN, "--max-sweeps", 1, "-o", "out") == 1
     assert names(files / "out") == ["control.obj", "report.json", "surface.ply"]
     assert "note     no picture: " in capsys.readouterr().out
 
 
 def test_without_tqdm_every_sweep_is_a_line(files, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "tqdm", None)
-    assert run(fit, "scan.xyz", "--control", "control.obj", "--levels", 1, "--max-sweeps", 2, "-o", "out") == 1
+    assert run(fit, "scan.xyz", *GIVEN, "--max-sweeps", 2, "-o", "out") == 1
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("sweep")]
     assert [line[:9] for line in lines] == ["sweep   1", "sweep   2"]
 
@@ -283,7 +375,7 @@ def test_far_start_is_a_warning_in_plain_words(files, capsys):
     np.savetxt("off.xyz", problem().points + (25, 0, 0))
     with warnings.catch_warnings():
         warnings.simplefilter("always")
-        assert run(fit, "off.xyz", "--control", "control.obj", "--levels", 1, "--max-sweeps", 0) == 1
+        assert run(fit, "off.xyz", *GIVEN, "--max-sweeps", 0) == 1
     assert "\nwarning: half of the scan lies over " in "\n" + capsys.readouterr().err
 
 
@@ -292,8 +384,13 @@ FIT_REFUSED = {
     "scan that is no numbers": ("text.xyz --control control.obj", "text.xyz, line 1"),
     "no such control mesh": ("scan.xyz --control none.obj", "none.obj"),
     "no levels": ("scan.xyz --control control.obj --levels 0", "a topology of one level or more"),
-    "scan in metres": ("metres.xyz --control control.obj --levels 1", "their units differ"),
-    "too few points": ("few.xyz --control control.obj --levels 1", "the scan has 2 points for 12 control vertices"),
+    "scan in metres": ("metres.xyz --control control.obj --levels 1 --align none", "their units differ"),
+    "scan in metres, to be aligned": ("metres.xyz --control control.obj --levels 1", "m and mm"),
+    "folder without scans": (".git", "holds no scan"),
+    "too few points": (
+        "few.xyz --control control.obj --levels 1 --align none",
+        "the scan has 2 points for 12 control vertices",
+    ),
 }
 
 
@@ -302,6 +399,7 @@ def test_fit_of_what_cannot_be_used_is_status_2_with_words_and_without_files(fil
     arguments, words = FIT_REFUSED[name]
     Path("text.xyz").write_text("hello world\n")
     Path("few.xyz").write_text("1 2 3\n4 5 6\n")
+    Path(".git").mkdir()
     assert run(fit, *arguments.split()) == 2
     err = capsys.readouterr().err
     assert err.startswith("error: ") and words in err and "Traceback" not in err
@@ -311,10 +409,9 @@ def test_fit_of_what_cannot_be_used_is_status_2_with_words_and_without_files(fil
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ("scan.xyz", "give SCAN and --control MESH"),
-        ("--control control.obj", "give SCAN and --control MESH"),
+        ("--control control.obj", "give SCAN to --control"),
         ("--example head", "invalid choice: 'head'"),
-        ("scan.xyz --control control.obj --scheme loop", "invalid choice: 'loop'"),
+        ("scan.xyz --control control.obj --scheme lop", "invalid choice: 'lop'"),
     ],
 )
 def test_misspelt_arguments_of_a_fit_are_status_2_with_the_usage(files, capsys, arguments, words):

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Sequence
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -203,12 +203,29 @@ def nearest(mesh: Trimesh, points: Float[np.ndarray, "p 3"]) -> Samples:
     return Samples(on, trimesh.unitize(np.sum(mesh.vertex_normals[mesh.faces[face]] * weights[:, :, None], axis=1)))
 
 
-def jaxsubdiv(problem: Problem, scheme: js.AbstractScheme, levels: int, **settings: Any) -> Trimesh:
-    template = align(problem.template(TEMPLATE_VERTICES), problem.scan)
+def jaxsubdiv(problem: Problem, scheme: js.AbstractScheme) -> Trimesh:
+    template = problem.template(TEMPLATE_VERTICES)
     mesh = js.ControlMesh(template.vertices, template.faces, template.vertex_normals)
-    topology = js.build_topology(mesh, scheme, levels)
-    found = fitting.fit(scheme, topology, mesh.control(), fitting.Scan(problem.scan), throw=False, **settings)
-    return Trimesh(np.asarray(found.surface.vertices, np.float64), found.surface.triangles(), process=False)
+    return surface_of(fitting.fit_scan(fitting.Scan(problem.scan), mesh, scheme=scheme, throw=False))
+
+
+def jaxsubdiv_alone(problem: Problem) -> Trimesh:
+    """Without a template, at as many faces."""
+    faces = 2 * TEMPLATE_VERTICES - 4
+    return surface_of(fitting.fit_scan(fitting.Scan(problem.scan), faces=faces, closed=True, throw=False))
+
+
+def jaxsubdiv_split(problem: Problem) -> Trimesh:
+    """The template split once: four times the control vertices."""
+    template = problem.template(TEMPLATE_VERTICES)
+    mesh = js.ControlMesh(template.vertices, template.faces, template.vertex_normals)
+    found = fitting.fit_scan(fitting.Scan(problem.scan), mesh, tolerance_mm=0.01, most_faces=6000, throw=False)
+    return surface_of(found)
+
+
+def surface_of(found: fitting.ScanFit) -> Trimesh:
+    surface = found.result.surface
+    return Trimesh(np.asarray(surface.vertices, np.float64), np.asarray(surface.triangles()), process=False)
 
 
 def open3d_poisson(problem: Problem) -> Trimesh:
@@ -259,10 +276,11 @@ def align(mesh: Trimesh, scan: Float[np.ndarray, "p 3"]) -> Trimesh:
     return Trimesh(moved.vertices, mesh.faces, vertex_normals=moved.normals, process=False)
 
 
-# Another method, a least-squares fit of a Loop surface say, is one more function and one more row here.
 METHODS: dict[str, Callable[[Problem], Trimesh]] = {
-    "jaxsubdiv-2": lambda problem: jaxsubdiv(problem, js.Interpolating(), 2),
-    "jaxsubdiv-3": lambda problem: jaxsubdiv(problem, js.Interpolating(), 3),
+    "jaxsubdiv": lambda problem: jaxsubdiv(problem, js.Interpolating()),
+    "jaxsubdiv-no-template": jaxsubdiv_alone,
+    "jaxsubdiv-split": jaxsubdiv_split,
+    "loop": lambda problem: jaxsubdiv(problem, js.Loop()),
     "open3d": open3d_poisson,
     "pymeshlab": pymeshlab_poisson,
     "nricp": nricp,

@@ -1,0 +1,112 @@
+"""From a scan to a fit in one call: alignment, a control mesh from the scan, splitting, landmarks, every scheme."""
+
+import numpy as np
+import optimistix as optx
+import pytest
+from scans import noise, problem
+from scipy.spatial.transform import Rotation
+
+import fitting
+import jaxsubdiv as js
+from fitting import Landmarks, Scan, fit_scan, misfit
+
+
+def mesh_and_scan(**scan) -> tuple[js.ControlMesh, Scan]:
+    p = problem()
+    mesh = js.ControlMesh(p.start.vertices, p.mesh.faces, p.start.normals)
+    return mesh, Scan(**({"points": p.points + noise()} | scan))
+
+
+def test_template_is_aligned_before_it_is_fitted():
+    scan, mesh = fitting.example("femur_distal")
+    turn = Rotation.from_rotvec([0.2, -0.3, 0.4]).as_matrix()
+    points, told = np.asarray(scan.points) @ turn.T + (30, -20, 50), []
+    found = fit_scan(Scan(points), mesh, levels=1, throw=False, max_sweeps=0, on_stage=told.append)
+    assert found.alignment is not None and found.result.rms[-1] < 0.6
+    np.testing.assert_allclose(found.alignment.transform[:3, :3], turn, atol=0.05)
+    assert told == ["aligns the control mesh with the scan", "fits 250 control vertices"]
+    with pytest.warns(UserWarning, match="Align the control mesh"):
+        there = fit_scan(Scan(points), mesh, levels=1, pose=None, max_sweeps=0, throw=False)
+    assert there.alignment is None and there.result.rms[-1] > 20
+
+
+def test_splitting_goes_on_until_the_tolerance_is_met():
+    """A scan with ripples that twelve control vertices cannot follow."""
+    mesh, _ = mesh_and_scan()
+    points = problem().points
+    ripples = 0.4 * np.sin(points[:, :1] / 3) * points / np.linalg.norm(points, axis=1, keepdims=True)
+    scan = Scan(points + ripples + 0.1 * noise())
+    coarse = fit_scan(scan, mesh, levels=1, pose=None, throw=False, max_sweeps=12)
+    assert coarse.outcome is None and misfit(coarse.result) > 0.1
+    fine = fit_scan(scan, mesh, levels=1, pose=None, tolerance_mm=0.08, throw=False, max_sweeps=12)
+    assert fine.outcome == "tolerance met" and fine.splits >= 1 and misfit(fine.result) <= 0.08
+    assert fine.start.n_faces == mesh.n_faces * 4**fine.splits
+    stopped = fit_scan(scan, mesh, levels=1, pose=None, tolerance_mm=0.001, most_faces=50, throw=False, max_sweeps=12)
+    assert stopped.outcome == "no more faces" and stopped.splits == 0
+
+
+def test_splitting_stops_at_the_noise():
+    mesh, _ = mesh_and_scan()
+    scan = Scan(problem().points + 4 * noise())
+    found = fit_scan(scan, mesh, levels=1, pose=None, tolerance_mm=1e-6, throw=False, max_sweeps=12)
+    assert found.outcome == "noise reached" and found.splits == 0
+    assert misfit(found.result) < 0.15 * found.result.noise
+
+
+def test_misfit_is_what_neighbours_have_in_common():
+    mesh, scan = mesh_and_scan()
+    found = fit_scan(scan, mesh, levels=1, pose=None, max_sweeps=0, throw=False).result
+    shared = 0.5 * np.sign(np.asarray(scan.points)[:, 0])
+    for distances, expected in ((shared, 0.5), (noise()[:, 0], 0.0), (shared + noise()[:, 0], 0.5)):
+        found.distances, found.noise = distances, 10.0
+        np.testing.assert_allclose(misfit(found), expected, atol=0.12)
+
+
+def test_landmarks_pull_the_fit_to_them():
+    mesh, scan = mesh_and_scan()
+    on_mesh = np.arange(4)
+    there = np.asarray(problem().truth.vertices)[:4] + (0, 0, 1.5)
+    options = {"levels": 1, "pose": None, "throw": False, "max_sweeps": 12}
+
+    def off(landmarks, **how):
+        found = fit_scan(scan, mesh, landmarks=landmarks, **options, **how).result
+        return np.linalg.norm(np.asarray(found.control.vertices)[:4] - there, axis=1).mean()
+
+    free, near, firm = (
+        off(None),
+        off(Landmarks(there, on_mesh)),
+        off(Landmarks(there, on_mesh), landmark_deviation=0.05),
+    )
+    assert firm < 0.5 * near < near < free
+    heavy = off(Landmarks(there, on_mesh, np.full(4, 400.0)))
+    np.testing.assert_allclose(heavy, firm, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "scheme",
+    [js.Loop(), js.CatmullClark(), js.ModifiedButterfly(), js.Kobbelt(), js.DooSabin(), js.BezierTriangle()],
+    ids=lambda scheme: type(scheme).__name__,
+)
+def test_every_scheme_is_fitted_by_the_same_call(scheme):
+    _, scan = mesh_and_scan()
+    mesh = problem().mesh
+    mesh = mesh.triangulated() if scheme.takes == (3,) else mesh
+    if scheme.takes == (4,):
+        mesh = js.ControlMesh(*cube())
+    found = fit_scan(scan, mesh, scheme=scheme, levels=2, pose=None, throw=False, max_sweeps=25)
+    assert found.result.result == optx.RESULTS.successful
+    assert found.result.rms[-1] < min(0.8, 0.9 * found.result.rms[0])  # few vertices, and not all can bend at will
+    assert np.all(found.result.uncertainty().surface > 0)
+
+
+def cube() -> tuple[np.ndarray, list]:
+    vertices = 0.8 * np.array([(x, y, z) for x in (-24, 24) for y in (-18, 18) for z in (-15, 15)], float)
+    return vertices, [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+
+
+def test_control_mesh_is_made_from_the_scan_where_none_is_given():
+    pytest.importorskip("pyacvd", reason="the extra `mesh` is not installed")
+    scan, _ = fitting.example("femur_distal")
+    found = fit_scan(scan, faces=120, levels=2, throw=False, max_sweeps=8)
+    assert found.alignment is None and 80 < found.start.n_faces < 160
+    assert found.result.rms[-1] < 0.4 < found.result.rms[0]
