@@ -18,6 +18,7 @@ from ._scan import Scan
 
 _BOUNDARY_SCALE = 1 / 3  # least scale of the loss at an open boundary, in control edges
 _ON_BOUNDARY = 1e-3  # how far, in parts of a face, a surface point may lie from a boundary and count as on it
+_STEEPEST = 0.5  # height over length: by how much the anatomy may turn away beyond a boundary
 _ON_SURFACE = 1e-6  # in control edges: a point that is closer is on the surface, in no direction from it
 _LEAST_COSINE = 0.5  # between a scan's normal and the surface's: beyond 60 degrees it is the other side of something
 
@@ -46,6 +47,7 @@ def look(
     surface: js.RefinedSurface,
     scan: Scan,
     open_vertices: Bool[np.ndarray, "v"],
+    crowded: Bool[np.ndarray, "p"],
     edge: float,
     loss: AbstractLoss,
     floor: float,
@@ -54,13 +56,14 @@ def look(
 
     Args:
         open_vertices: which vertices of the surface lie on a boundary.
+        crowded: points that have others around them, as scattered outliers have not.
         edge: length of a control edge in mm.
         loss: how a point loses weight with its distance.
         floor: the least scale of the loss in mm.
     """
     at = closest_points(surface, np.asarray(scan.points))
     edge_and_floor = (jnp.asarray(value, scan.points.dtype) for value in (edge, floor))
-    return _measure(surface, scan, at, open_vertices, *edge_and_floor, loss)
+    return _measure(surface, scan, at, open_vertices, crowded, *edge_and_floor, loss)
 
 
 @jax.jit
@@ -69,6 +72,7 @@ def _measure(
     scan: Scan,
     at: js.SurfacePoint,
     open_vertices: Bool[Array | np.ndarray, "v"],
+    crowded: Bool[Array | np.ndarray, "p"],
     edge: Float[Array, ""],
     floor: Float[Array, ""],
     loss: AbstractLoss,
@@ -85,10 +89,13 @@ def _measure(
     # Beyond a boundary the distance runs along the surface, and says nothing of the noise across it.
     noise = noise_scale(distance / spread, jnp.where(at_boundary, 0.0, given))
     scale = jnp.maximum(noise, floor)
-    # Near a boundary the surface may have to grow, by up to a control edge: what is farther is not covered by the mesh.
+    # Near a boundary the surface may have to grow, by up to a control edge, to points that go on as it does: what is
+    # farther is not covered by the mesh, and outliers lie there in all directions.
     at_its_scale = jnp.where(at_boundary, jnp.maximum(scale, edge * _BOUNDARY_SCALE), scale * spread)
     weights = given * loss.weight(distance / at_its_scale)
-    weights = jnp.where(at_boundary & (distance > edge), 0.0, weights)
+    across = jnp.abs(dot(normals, away))[:, 0]
+    goes_on = crowded & (distance < edge) & (across < 3 * scale * spread + _STEEPEST * distance)
+    weights = jnp.where(at_boundary & ~goes_on, 0.0, weights)
     # The derivative of a distance is along it: across the face, or from the edge or boundary that is closest.
     directions = jnp.where(distance[:, None] > edge * _ON_SURFACE, unit(away), normals)
     return Look(

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 import fitting
 import jaxsubdiv as js
 from fitting import Landmarks, Scan, fit_scan, misfit
+from fitting._fit_scan import _outcome
 
 
 def mesh_and_scan(**scan) -> tuple[js.ControlMesh, Scan]:
@@ -46,11 +47,14 @@ def test_splitting_goes_on_until_the_tolerance_is_met():
 
 
 def test_splitting_stops_at_the_noise():
-    mesh, _ = mesh_and_scan()
-    scan = Scan(problem().points + 4 * noise())
-    found = fit_scan(scan, mesh, levels=1, pose=None, tolerance_mm=1e-6, throw=False, max_sweeps=12)
-    assert found.outcome == "noise reached" and found.splits == 0
-    assert misfit(found.result) < 0.15 * found.result.noise
+    mesh, scan = mesh_and_scan()
+    found = fit_scan(scan, mesh, levels=1, pose=None, max_sweeps=0, throw=False).result
+    found.distances, found.noise = noise()[:, 0], SIGMA
+    assert _outcome(found, mesh, 1e-6, most_faces=10_000) == "noise reached"
+    found.distances = 0.5 + noise()[:, 0]
+    assert _outcome(found, mesh, 1e-6, most_faces=10_000) is None
+    assert _outcome(found, mesh, 0.7, most_faces=10_000) == "tolerance met"
+    assert _outcome(found, mesh, None, most_faces=10_000) is None
 
 
 def test_misfit_is_what_neighbours_have_in_common():
