@@ -131,7 +131,7 @@ def _draw_error(ax: Any, result: FitResult, view: Float[np.ndarray, "3 3"]) -> N
     from matplotlib.colors import Normalize
 
     surface, distances = result.surface, surface_distances(result)
-    limit = max(float(np.percentile(np.abs(result.distances), 98)), 1e-6)
+    limit = _limit(result, 98)
     scale = Normalize(-limit, limit)
     at_faces = np.concatenate([distances[np.asarray(surface.faces[size])].mean(axis=1) for size in (3, 4)])
     known = ~np.isnan(at_faces)[:, None]
@@ -143,18 +143,24 @@ def _draw_error(ax: Any, result: FitResult, view: Float[np.ndarray, "3 3"]) -> N
     bar.set_label("mm, outside is positive")
 
 
+def _limit(result: FitResult, percentile: float) -> float:
+    """A distance in mm that so many of the inliers stay within: outliers would bleach everything else."""
+    inliers = np.abs(result.distances[result.inliers])
+    return max(float(np.percentile(inliers, percentile)), 1e-6) if len(inliers) else 1.0
+
+
 def _draw_counts(ax: Any, result: FitResult) -> None:
-    limit = max(float(np.percentile(np.abs(result.distances), 99)), 1e-6)
+    limit = 1.2 * _limit(result, 100)
     ax.hist(np.clip(result.distances, -limit, limit), bins=80, color="tab:blue")
     ax.set_xlabel("signed distance, mm (the ends hold what is beyond)")
     ax.set_ylabel("scan points")
-    ax.set_title(f"RMS {result.rms[-1]:.3f} mm")
+    ax.set_title(f"RMS {result.rms[-1]:.3f} mm, {np.mean(result.inliers):.0%} within 3 x the noise")
     ax.grid(True, alpha=0.3)
 
 
 def _draw_convergence(ax: Any, result: FitResult) -> None:
-    ax.semilogy(result.rms, marker="o", markersize=3, color="tab:blue")
+    ax.semilogy(result.robust_rms, marker="o", markersize=3, color="tab:blue")
     ax.set_xlabel("sweep")
-    ax.set_ylabel("RMS distance, mm")
+    ax.set_ylabel("RMS distance by robust weights, mm")
     ax.set_title("convergence")
     ax.grid(True, which="both", alpha=0.3)
