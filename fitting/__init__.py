@@ -15,6 +15,8 @@ from ._mesh_topology import MeshTopology as MeshTopology
 from ._mesh_topology import topology_of as topology_of
 from ._picture import draw_fit as draw_fit
 from ._posterior import Uncertainty as Uncertainty
+from ._recipe import Recipe as Recipe
+from ._recipe import load_recipe as load_recipe
 from ._refit import Refit as Refit
 from ._report import Report as Report
 from ._residuals import Priors as Priors
@@ -26,6 +28,7 @@ from ._robust import LeastSquares as LeastSquares
 from ._robust import Tukey as Tukey
 from ._robust import cauchy as cauchy
 from ._robust import geman_mcclure as geman_mcclure
+from ._saved import load as load
 from ._scan import Scan as Scan
 from ._scan import ScanError as ScanError
 from ._scan import read_scan as read_scan

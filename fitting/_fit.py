@@ -18,6 +18,7 @@ from ._correspondence import boundary_vertices
 from ._free import Free, apply_offset, edge_length
 from ._look import Look, look
 from ._problem import Problem
+from ._recipe import Recipe
 from ._residuals import Priors
 from ._result import FitResult
 from ._robust import AbstractLoss, geman_mcclure
@@ -92,6 +93,18 @@ def fit(
     # Made here and not in the signature: arrays made while a module loads would settle JAX's device and precision.
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
     control = js.Control(control.vertices, _given_normals(topology, control))
+    recipe = Recipe(
+        scheme,
+        len(topology.levels),
+        free,
+        priors,
+        loss,
+        max_sweeps,
+        tolerance,
+        topology.mesh_normals,
+        topology.limit is not None,
+    )
+    start = control
     surface = js.refine(scheme, topology, control)
     open_vertices, edge = boundary_vertices(surface), float(edge_length(topology, control.vertices))
     seen = look(surface, scan, open_vertices, edge, loss, _LEAST_NOISE * edge)
@@ -132,6 +145,8 @@ def fit(
         result=result,
         problem=problem,
         seen=seen,
+        recipe=recipe,
+        start=start,
     )
     if throw and result != optx.RESULTS.successful:
         raise RuntimeError(

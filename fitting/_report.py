@@ -35,7 +35,7 @@ class Report:
         rms_inliers: root mean square distance of these.
         h: fitted tangent length coefficient, one or one a level; None where the scheme has none.
         rms_per_sweep: at the start, then after every sweep.
-        coverage: share of the surface's area that the scan covers: where an inlier is paired with a place that is nearer
+        coverage: share of the surface's area that the scan covers: where an inlier is paired with a place nearer
             than five times the median distance from such a place to the next, and not on the other side.
         mean_to_scan, rms_to_scan, percentile_95_to_scan, maximum_to_scan: the other direction, of the absolute distance
             from the surface to the scan where the scan covers it, every part of the surface by its area. It is a mean

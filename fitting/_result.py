@@ -1,6 +1,7 @@
 """What a fit returns."""
 
 import functools
+import os
 from typing import final
 
 import numpy as np
@@ -14,6 +15,7 @@ from ._free import edge_length
 from ._look import Look
 from ._posterior import Posterior, Uncertainty
 from ._problem import Problem
+from ._recipe import Recipe
 from ._refit import Refit, make_refit
 from ._report import Report, WorstPlace
 from ._scan import Scan
@@ -37,6 +39,8 @@ class FitResult:
         noise: standard deviation in mm of the Gaussian part of the distances: the noise of the scan, and the detail
             that the control mesh is too coarse for.
         result: `optimistix.RESULTS.successful`, or why the fit stopped without having converged.
+        recipe: the settings that the fit was given, to fit the next scan in the same way.
+        start: the control where the fit started, with the normals that it took.
     """
 
     def __init__(
@@ -55,6 +59,8 @@ class FitResult:
         result: optx.RESULTS,
         problem: Problem,
         seen: Look,
+        recipe: Recipe | None = None,
+        start: js.Control | None = None,
     ):
         self.control = control
         self.scheme = scheme
@@ -67,6 +73,8 @@ class FitResult:
         self.robust_rms = robust_rms
         self.noise = noise
         self.result = result
+        self.recipe = recipe
+        self.start = start
         self._problem, self._seen = problem, seen
 
     @functools.cached_property
@@ -96,6 +104,20 @@ class FitResult:
     def refit(self) -> Refit:
         """The fitted control as a differentiable function of scan points and weights; see `Refit`."""
         return make_refit(self.posterior)
+
+    def save(self, folder: str | os.PathLike[str]) -> None:
+        """Write the fit into a folder, made where there is none, for `fitting.load`; and its settings.
+
+        Of the two files `fit.npz` holds everything, scan and control mesh included, and `recipe.json` the settings, for
+        `fitting.load_recipe` and for people. Each is complete or not there.
+
+        Raises:
+            OSError: the folder cannot be made or written.
+            ValueError: the scheme or the loss is of a class of your own, or the control mesh has creases.
+        """
+        from ._saved import save  # which makes results itself
+
+        save(folder, self)
 
     @property
     def inliers(self) -> Bool[np.ndarray, "p"]:
