@@ -71,7 +71,8 @@ def save(folder: str | os.PathLike[str], result: FitResult) -> None:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with replacing(folder / _FIT) as path:
-        np.savez(path, **{name: np.asarray(value) for name, value in arrays.items()})
+        as_numpy: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
+        np.savez(path, **as_numpy)
     with replacing(folder / _RECIPE) as path:
         path.write_text(text + "\n", encoding="utf-8")
 
