@@ -12,7 +12,7 @@ const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const unit = (a) => { const n = Math.hypot(...a) || 1; return a.map((x) => x / n); };
 
-function turnBy(x, y) { // about the axes of the screen
+function turnBy(x, y) { // what is in front moves to the right by x, down by y, in radians
   let [right, up, towards] = [0, 3, 6].map((i) => eye.turn.slice(i, i + 3));
   const mix = (a, b, angle) => a.map((v, i) => v * Math.cos(angle) + b[i] * Math.sin(angle));
   [right, towards] = [mix(right, towards, x), mix(towards, right, -x)];
@@ -41,9 +41,10 @@ void main() {
 }`;
 const FRAGMENT = `#version 300 es
 precision highp float;
-in vec3 n; in float v; uniform int map; uniform float limit; uniform vec3 plain; out vec4 colour;
+in vec3 n; in float v; uniform int map; uniform bool round; uniform float limit; uniform vec3 plain; out vec4 colour;
 vec3 stops(float t, vec3 a, vec3 b, vec3 c) { return t < 0.5 ? mix(a, b, 2.0 * t) : mix(b, c, 2.0 * t - 1.0); }
 void main() {
+  if (round && length(gl_PointCoord - 0.5) > 0.5) discard;
   vec3 c = plain;
   if (map > 0 && v < 1e29) {
     float t = clamp(abs(v) / limit, 0.0, 1.0);
@@ -107,6 +108,7 @@ class View {
   draw(shape, { map = 0, limit = 1, plain = [0.82, 0.8, 0.77], size = 1, nearer = 0, first = 0, count = shape.count } = {}) {
     const gl = this.gl, at = (name) => gl.getUniformLocation(this.program, name);
     gl.uniform1i(at("map"), map);
+    gl.uniform1i(at("round"), shape.mode === gl.POINTS ? 1 : 0);
     gl.uniform1f(at("limit"), limit);
     gl.uniform3fv(at("plain"), plain);
     gl.uniform1f(at("size"), size * (window.devicePixelRatio || 1));
@@ -153,7 +155,7 @@ function followHand(canvas) {
       zoomBy(spread() / (before || 1));
       move(x / 2, y / 2);
     } else if (event.shiftKey || event.buttons & 6) move(x, y);
-    else turnBy(-x / 150, -y / 150);
+    else turnBy(x / 150, y / 150);
     refresh();
   });
   for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (e) => hands.delete(e.pointerId));
@@ -164,7 +166,7 @@ function followHand(canvas) {
     zoomBy(Math.exp(-event.deltaY / 500));
     refresh();
   }, { passive: false });
-  const keys = { ArrowLeft: [0.1, 0], ArrowRight: [-0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
+  const keys = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, -0.1], ArrowDown: [0, 0.1] };
   canvas.addEventListener("keydown", (event) => {
     if (keys[event.key]) turnBy(...keys[event.key]);
     else if (event.key === "+" || event.key === "-") zoomBy(event.key === "+" ? 1.2 : 1 / 1.2);
@@ -203,7 +205,7 @@ function begin() {
   const left = new View(element("surface"), (view) => {
     const name = chosen();
     view.draw(shapes[name], { map: MAPS[name][0], limit: data[name].limit });
-    if (element("points").checked) view.draw(shapes.points, { map: 1, limit: data.distance.limit, size: 3, plain: [0.2, 0.2, 0.2] });
+    if (element("points").checked) view.draw(shapes.points, { map: 1, limit: data.distance.limit, size: 3, nearer: 0.002, plain: [0.2, 0.2, 0.2] });
     view.draw(shapes.places, { size: 7, nearer: 0.01, plain: [0.1, 0.1, 0.1] });
     if (eye.place >= 0) view.draw(shapes.places, { size: 14, nearer: 0.02, plain: [1, 0.65, 0], first: eye.place, count: 1 });
   });
@@ -214,8 +216,8 @@ function begin() {
   shapes.places = left.shape(gl.POINTS, new Float32Array(data.places.flatMap((place) => place.position)));
   const right = new View(element("control"), (view) => {
     view.draw(shapes.faces, { plain: [0.93, 0.92, 0.9] });
-    view.draw(shapes.edges, { plain: [0.25, 0.25, 0.25] });
-    if (element("start")?.checked) view.draw(shapes.start, { plain: [0.9, 0.45, 0.05] });
+    view.draw(shapes.edges, { plain: [0.25, 0.25, 0.25], nearer: 0.004 });
+    if (element("start")?.checked) view.draw(shapes.start, { plain: [0.9, 0.45, 0.05], nearer: 0.002 });
   });
   const control = floats(data.control.vertices), faces = whole(data.control.triangles), edges = whole(data.control.edges);
   shapes.faces = right.shape(gl.TRIANGLES, control, { rows: faces, normals: vertexNormals(control, faces) });

@@ -20,7 +20,7 @@ from ._result import FitResult
 
 _MOST_POINTS = 20_000  # of the scan that the page shows: they are for the eye, and 16 bytes each
 _WIDTH, _HEIGHT = 520, 240  # of the charts
-_LEFT, _BOTTOM, _TOP = 52, 40, 8  # room for their axes
+_LEFT, _RIGHT, _BOTTOM, _TOP = 52, 24, 40, 8  # room for their axes
 
 
 def write_page(
@@ -154,14 +154,17 @@ def _base64(values: np.ndarray, dtype: DTypeLike) -> str:
 def _histogram(result: FitResult) -> str:
     limit = max(float(np.percentile(np.abs(result.distances), 99)), 1e-6)
     counts, _ = np.histogram(np.clip(result.distances, -limit, limit), bins=60, range=(-limit, limit))
-    width, most = (_WIDTH - _LEFT - 8) / len(counts), int(counts.max())
+    width, most = (_WIDTH - _LEFT - _RIGHT) / len(counts), int(counts.max())
     height = _HEIGHT - _BOTTOM - _TOP
     bars = [
         f'<rect x="{_LEFT + i * width:.1f}" y="{_HEIGHT - _BOTTOM - count / most * height:.1f}" '
         f'width="{width - 1:.1f}" height="{count / most * height:.1f}" fill="#6b93bd"/>'
         for i, count in enumerate(counts)
     ]
-    ticks = [(_LEFT + (_WIDTH - _LEFT - 8) * (i / 4), f"{limit * (i / 2 - 1):+.2g}") for i in range(5)]
+    ticks = [
+        (_LEFT + (_WIDTH - _LEFT - _RIGHT) * (i / 4), f"{limit * (i / 2 - 1):+.2g}" if i != 2 else "0")
+        for i in range(5)
+    ]
     return _chart(
         bars, ticks, [(0.0, "0"), (1.0, f"{most:,}")], "mm, outside is positive; the ends hold what is beyond"
     )
@@ -172,7 +175,7 @@ def _convergence(result: FitResult) -> str:
     values = np.log10(np.maximum(result.rms, 1e-12))
     low, high = float(values.min()), float(values.max())
     low, high = (low - 0.05, high + 0.05) if high - low < 0.1 else (low, high)
-    x = _LEFT + 8 + (_WIDTH - _LEFT - 24) * np.arange(len(values)) / max(len(values) - 1, 1)
+    x = _LEFT + 8 + (_WIDTH - _LEFT - _RIGHT - 8) * np.arange(len(values)) / max(len(values) - 1, 1)
     y = _HEIGHT - _BOTTOM - (_HEIGHT - _BOTTOM - _TOP) * (values - low) / (high - low)
     line = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
     marks = [f'<polyline points="{line}" fill="none" stroke="#6b93bd" stroke-width="2"/>']
@@ -189,7 +192,7 @@ def _chart(marks: list[str], ticks: list[tuple[float, str]], levels: list[tuple[
     lines = [f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{html.escape(name)}">']
     for part, word in levels:
         y = base - part * (base - _TOP)
-        lines.append(f'<line x1="{_LEFT}" x2="{_WIDTH - 8}" y1="{y:.1f}" y2="{y:.1f}" stroke="#e4e4e4"/>')
+        lines.append(f'<line x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}" stroke="#e4e4e4"/>')
         lines.append(f'<text x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{word}</text>')
     lines += marks
     lines += [f'<text x="{x:.1f}" y="{base + 16}" text-anchor="middle">{word}</text>' for x, word in ticks]

@@ -1,8 +1,13 @@
 """The report of a fit in numbers, and as a page."""
 
+import base64
 import dataclasses
 import functools
+import html.parser
 import json
+import shutil
+import subprocess
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +19,8 @@ from scipy.spatial import KDTree
 import fitting
 import jaxsubdiv as js
 from fitting._coverage import distances_to_scan, vertex_areas, weighted_quantile, worst_places
-from fitting._look import Look
+from fitting._look import Look, look
+from fitting._page import write_page
 
 
 @functools.cache
@@ -53,8 +59,6 @@ def sphere_of_quads(n: int):
 
 def seen_from(surface: js.RefinedSurface, points: np.ndarray) -> tuple[Look, np.ndarray]:
     """Pairs and signed distances, without a fit."""
-    from fitting._look import look
-
     seen = look(surface, fitting.Scan(points), np.zeros(len(surface.vertices), bool), 8.0, fitting.Huber(), 1e-3)
     return seen, np.asarray(seen.distances)
 
@@ -235,3 +239,151 @@ def test_control_mesh_of_a_fit_is_the_one_that_it_started_from_moved():
     for size in (3, 4):
         np.testing.assert_array_equal(mesh.faces[size], problem().mesh.faces[size])
     assert N_POINTS == result.report().n_points
+
+
+# The page
+
+
+class Page(html.parser.HTMLParser):
+    """Elements of a page with their attributes, and the text in some of them."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.open, self.elements, self.texts = [], [], {}
+        self.feed(text)
+        self.close()
+        self.data = json.loads(self.texts["data"])
+
+    def handle_starttag(self, tag, attrs):
+        attrs = dict(attrs)
+        self.elements.append((tag, attrs))
+        if tag not in ("meta", "input"):
+            self.open.append((tag, attrs.get("id", tag)))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop()[0] == tag
+
+    def handle_data(self, data):
+        if self.open:
+            key = self.open[-1][1]
+            self.texts[key] = self.texts.get(key, "") + data
+
+    def all(self, tag):
+        return [attrs for name, attrs in self.elements if name == tag]
+
+
+def page_of(path: Path) -> Page:
+    page = Page(path.read_text(encoding="utf-8"))
+    assert page.open == []
+    return page
+
+
+def array(text: str, dtype: str, width: int) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), dtype).reshape(-1, width)
+
+
+@functools.cache
+def written(folder: Path, uncertainty: bool) -> Path:
+    path = folder / f"{uncertainty}.html"
+    write_page(path, noisy(), title="</title><script>alert(1)</script> & @@DATA@@", uncertainty=uncertainty)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("pages")
+
+
+def test_page_holds_the_surface_the_control_mesh_and_the_scan(folder):
+    result, data = noisy(), page_of(written(folder, True)).data
+    surface, mesh = result.surface, result.control_mesh
+    for text, values in (
+        (data["surface"]["vertices"], surface.vertices),
+        (data["points"]["vertices"], result.scan.points),
+        (data["control"]["vertices"], result.control.vertices),
+        (data["start"], problem().start.vertices),
+        (data["points"]["values"], result.distances[:, None]),
+        (data["deviation"]["values"], result.uncertainty().surface[:, None]),
+        (data["distance"]["values"], distances_to_scan(surface, result._seen, result.inliers)[:, None]),
+    ):
+        np.testing.assert_array_equal(array(text, "<f4", values.shape[1]), np.asarray(values, np.float32))
+    np.testing.assert_array_equal(array(data["surface"]["triangles"], "<u4", 3), surface.triangles())
+    np.testing.assert_array_equal(array(data["control"]["edges"], "<u4", 2), mesh.half_edges.edges)
+    assert len(array(data["control"]["triangles"], "<u4", 3)) == len(mesh.faces[3]) + 2 * len(mesh.faces[4])
+    view = np.reshape(data["view"], (3, 3))
+    np.testing.assert_allclose(view @ view.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(view) > 0
+    assert np.linalg.norm(np.asarray(surface.vertices) - data["centre"], axis=1).max() <= data["radius"] * (1 + 1e-9)
+
+
+def test_page_has_the_table_of_the_report_with_places_to_turn_to(folder):
+    page, report = page_of(written(folder, True)), noisy().report(uncertainty=True)
+    rows = len(page.all("tr"))
+    assert rows == len(report.as_rows()) == len(page.all("td"))
+    assert [attrs["data-place"] for attrs in page.all("button")] == [str(i) for i in range(len(report.worst))]
+    assert [place["position"] for place in page.data["places"]] == [place.position for place in report.worst]
+    for name, value in report.as_rows():
+        assert name in page.texts["th"] and value in page.texts["td"] + page.texts["button"]
+
+
+def test_page_needs_no_network_and_a_title_cannot_break_it(folder):
+    page, text = page_of(written(folder, True)), written(folder, True).read_text(encoding="utf-8")
+    assert "://" not in text and "url(" not in text and "import" not in page.texts["script"]
+    assert not any({"src", "href", "srcset", "action"} & set(attrs) for _, attrs in page.elements)
+    policy = next(attrs["content"] for attrs in page.all("meta") if "http-equiv" in attrs)
+    assert policy.startswith("default-src 'none'")
+    assert page.texts["title"] == page.texts["h1"] == "</title><script>alert(1)</script> & @@DATA@@"
+    assert len(page.all("script")) == 2
+
+
+def test_page_without_uncertainty_has_no_switch_to_it(folder):
+    page, other = page_of(written(folder, False)), page_of(written(folder, True))
+    assert page.data["deviation"] is None
+    radios = [[attrs["value"] for attrs in p.all("input") if attrs["type"] == "radio"] for p in (page, other)]
+    assert radios == [["distance"], ["distance", "deviation"]]
+
+
+def test_charts_of_the_page_show_every_point_and_every_sweep(folder):
+    page, result = page_of(written(folder, False)), noisy()
+    heights = np.array([float(attrs["height"]) for attrs in page.all("rect")])
+    limit = np.percentile(np.abs(result.distances), 99)
+    counts = np.histogram(np.clip(result.distances, -limit, limit), 60, (-limit, limit))[0]
+    np.testing.assert_allclose(heights / heights.max(), counts / counts.max(), atol=1e-3)
+    y = np.array([float(attrs["cy"]) for attrs in page.all("circle")])
+    drop = np.log(result.rms[0] / result.rms)
+    assert len(y) == len(result.rms)
+    np.testing.assert_allclose((y - y[0]) / (y[-1] - y[0]), drop / drop[-1], atol=1e-3)
+
+
+def test_page_of_a_fit_that_did_not_converge_says_so_and_takes_a_start(tmp_path):
+    result = problem().fit(max_sweeps=0)
+    write_page(tmp_path / "fit.html", result, start=problem().mesh, uncertainty=False)
+    page = page_of(tmp_path / "fit.html")
+    assert page.texts["title"] == "Fit" and page.all("p")[0] == {"class": "bad"}
+    np.testing.assert_array_equal(array(page.data["start"], "<f4", 3), np.float32(problem().mesh.vertices))
+    assert [path.name for path in tmp_path.iterdir()] == ["fit.html"]
+
+
+def test_page_of_a_large_surface_stays_under_three_megabytes(tmp_path, monkeypatch):
+    """10,000 vertices and 30,000 points, of which 20,000 are shown."""
+    p, result = problem(), problem().fit(max_sweeps=0)
+    report = dataclasses.replace(result.report(), n_points=30_000)
+    monkeypatch.setattr(fitting.FitResult, "report", lambda self, **_: report)
+    topology = js.build_topology(p.mesh, js.Interpolating(), 5)
+    result.surface = js.refine(js.Interpolating(), topology, p.start)
+    points = np.tile(np.asarray(result.scan.points), (50, 1))
+    result.scan, result.distances = fitting.Scan(points), np.tile(result.distances, 50)
+    monkeypatch.setattr("fitting._page.distances_to_scan", lambda surface, *_: np.full(len(surface.vertices), np.nan))
+    write_page(tmp_path / "fit.html", result, uncertainty=False)
+    assert len(result.surface.vertices) > 10_000 and (tmp_path / "fit.html").stat().st_size < 3_000_000
+    page = page_of(tmp_path / "fit.html")
+    assert np.isnan(array(page.data["distance"]["values"], "<f4", 1)).all()
+    assert len(array(page.data["points"]["values"], "<f4", 1)) == 20_000
+    assert "(an even part of 20,000)" in page.texts["label"]
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node reads the script as a browser would")
+def test_script_of_the_page_is_sound_javascript():
+    script = Path(fitting.__file__).parent / "_page.js"
+    subprocess.run(["node", "--check", script], check=True, timeout=60)
+    assert "</" not in script.read_text(encoding="utf-8")
