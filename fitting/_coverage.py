@@ -14,6 +14,7 @@ from ._look import Look
 _NEAREST = 8  # scan points that make a local mean or median
 _REACH = 5.0  # times the usual distance from a paired place to the next: so far the scan covers the surface around one
 _LEAST_COSINE = 0.5  # between normals: beyond 60 degrees a point belongs to the other side of something thin
+_CENTRES, _NEAR_PLACE = 5_000, (9, 200)  # places that are looked at, and the points that tell of each
 _MANY = 100_000  # of more points an even part tells as much of spacings and local medians
 
 
@@ -66,21 +67,25 @@ def worst_places(
 ) -> list[Place]:
     """Where the scan lies farthest from the surface, by the median of the nearest points: one outlier makes no place.
 
+    As many points count as lie within a quarter of a control edge on average, from 9 to 200.
+
     Args:
         edge: length of a control edge in mm; places are at least so far apart.
         n: how many at most.
     """
     on = _at_pairs(np.asarray(surface.vertices, np.float64), seen)
-    some = slice(None, None, -(-len(on) // _MANY))
-    near = nearest_rows(KDTree(on[some]), on[some], min(_NEAREST + 1, len(on[some])))[1]
-    median = np.median(distances[some][near], axis=1)
+    many, centres = (slice(None, None, -(-len(on) // most)) for most in (_MANY, _CENTRES))
+    a_disc = np.pi * (edge / 4) ** 2 / float(surface.areas().sum())
+    k = min(int(np.clip(len(on[many]) * a_disc, *_NEAR_PLACE)), len(on[many]))
+    near = nearest_rows(KDTree(on[many]), on[centres], k)[1]
+    median = np.median(distances[many][near], axis=1)
     left, places = np.abs(median), []
     while len(places) < n and left.max() >= 0:
         worst = int(np.argmax(left))
-        position = on[some][worst]
+        position = on[centres][worst]
         n_points = int(np.sum(np.linalg.norm(on - position, axis=1) <= edge / 2))
         places.append(Place(position, float(median[worst]), n_points))
-        left[np.linalg.norm(on[some] - position, axis=1) < edge] = -1
+        left[np.linalg.norm(on[centres] - position, axis=1) < edge] = -1
     return places
 
 

@@ -10,8 +10,8 @@ class WorstPlace:
 
     Attributes:
         position: x, y, z on the surface, in mm.
-        distance: signed distance in mm, positive where the scan lies outside: the median of the nine nearest points, so
-            that one outlier alone makes no place.
+        distance: signed distance in mm, positive where the scan lies outside: the median of the nearest points, nine or
+            as many as lie within a quarter of a control edge on average, so that neither outliers nor noise make it.
         n_points: how many scan points lie within half a control edge.
     """
 

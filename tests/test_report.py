@@ -162,6 +162,16 @@ def test_worst_places_are_the_bumps_and_not_the_outliers():
     assert places[0].n_points == np.sum(np.linalg.norm(np.asarray(on) - positions[0], axis=1) <= 4)
 
 
+def test_worst_place_of_many_noisy_points_is_the_bump_and_not_the_noise():
+    surface, points = on_sphere(), scan_of_sphere(30.0, 120_000)
+    bump = 0.8 * np.exp(-(np.linalg.norm(points - (0, 30, 0), axis=1, keepdims=True) ** 2) / 36)
+    points *= 1 + (bump + np.random.default_rng(5).normal(size=(120_000, 1))) / 30
+    seen, distances = seen_from(surface, points)
+    first, second, *_ = worst_places(surface, seen, distances, 8.0)
+    assert np.linalg.norm(first.position - (0, 30, 0)) < 4 and 0.5 < first.distance < 1.1
+    assert abs(second.distance) < 0.75  # of nine points it would be 1.7
+
+
 def test_fewer_places_than_five_where_the_surface_is_small():
     surface, points = on_sphere(), scan_of_sphere(30.1, 200)
     seen, distances = seen_from(surface, points)
