@@ -16,10 +16,14 @@ from ._landmarks import match_landmarks as match_landmarks
 from ._landmarks import read_landmarks as read_landmarks
 from ._mesh_topology import MeshTopology as MeshTopology
 from ._mesh_topology import topology_of as topology_of
+from ._page import write_page as write_page
 from ._picture import draw_fit as draw_fit
 from ._posterior import Uncertainty as Uncertainty
+from ._recipe import Recipe as Recipe
+from ._recipe import load_recipe as load_recipe
 from ._refit import Refit as Refit
 from ._report import Report as Report
+from ._report import WorstPlace as WorstPlace
 from ._residuals import Priors as Priors
 from ._result import FitResult as FitResult
 from ._robust import AbstractLoss as AbstractLoss
@@ -29,6 +33,7 @@ from ._robust import LeastSquares as LeastSquares
 from ._robust import Tukey as Tukey
 from ._robust import cauchy as cauchy
 from ._robust import geman_mcclure as geman_mcclure
+from ._saved import load as load
 from ._scan import Scan as Scan
 from ._scan import ScanError as ScanError
 from ._scan import read_scan as read_scan

@@ -23,6 +23,7 @@ from ._example import Example, example
 from ._fit import Sweep
 from ._fit_scan import ScanFit, fit_scan, misfit
 from ._landmarks import Landmarks, match_landmarks, read_landmarks
+from ._page import write_page
 from ._picture import draw_fit, surface_distances
 from ._scan import Scan, read_scan
 
@@ -121,7 +122,7 @@ def _run(scan: Path | None, folder: Path, options: argparse.Namespace) -> dict:
                 on_sweep=progress.update,
             )
         seconds = time.perf_counter() - began
-        report, off = found.result.report(), misfit(found.result)
+        report, off = found.result.report(uncertainty=True), misfit(found.result)
         print(f"done     in {seconds:.1f} s{_ending(found, off)}\n\n{report}\n")
         _save(folder, found, name)
     except (js.MeshError, ValueError, TypeError, OSError, ImportError) as error:
@@ -175,13 +176,14 @@ def _save(folder: Path, found: ScanFit, name: str) -> None:
     """The fit as files, each complete or not there at all."""
     result = found.result
     folder.mkdir(parents=True, exist_ok=True)
-    fitted = js.ControlMesh(result.control.vertices, found.start.faces, result.control.normals, check=False)
-    js.write_mesh(folder / "control.obj", fitted)
+    js.write_mesh(folder / "control.obj", result.control_mesh)
     values = {"distance_mm": surface_distances(result), "deviation_mm": result.uncertainty().surface}
     js.write_mesh(folder / "surface.ply", result.surface, vertex_data=values)
     with replacing(folder / "report.json") as path:
-        path.write_text(result.report().as_json() + "\n", encoding="utf-8")
-    written = ["control.obj", "surface.ply", "report.json"]
+        path.write_text(result.report(uncertainty=True).as_json() + "\n", encoding="utf-8")
+    write_page(folder / "fit.html", result, title=name, start=found.start)
+    result.save(folder)
+    written = ["control.obj", "surface.ply", "report.json", "fit.html", "fit.npz", "recipe.json"]
     try:
         with replacing(folder / "fit.png") as path:
             draw_fit(result, found.start, title=name).savefig(path)
@@ -272,8 +274,9 @@ def _parser() -> argparse.ArgumentParser:
         "the anatomy. The control mesh is aligned with the scan first, or made from it where none is given. Without "
         "SCAN it runs an example that ships with the package.",
         epilog="OUT gets control.obj (fitted control mesh with normals), surface.ply (refined surface, with the signed "
-        "distance of the scan and the standard deviation of the surface in mm at every vertex), report.json and "
-        "fit.png; of several scans, a folder each and summary.csv. Lengths are in mm. Exit status: 0 converged, 1 not "
+        "distance of the scan and the standard deviation of the surface in mm at every vertex), report.json, fit.html "
+        "(a page to turn the surface in, without a network), fit.png, and fit.npz and recipe.json for `fitting.load`; of "
+        "several scans, a folder each and summary.csv. Lengths are in mm. Exit status: 0 converged, 1 not "
         "converged (files are written all the same), 2 an input cannot be used.",
     )
     add = parser.add_argument

@@ -21,6 +21,7 @@ from ._landmarks import Landmarks, place_landmarks
 from ._look import Look, look
 from ._outliers import dense_points
 from ._problem import Problem
+from ._recipe import Recipe
 from ._residuals import Anchors, Priors
 from ._result import FitResult
 from ._robust import AbstractLoss, geman_mcclure
@@ -99,6 +100,18 @@ def fit(
     # Made here and not in the signature: arrays made while a module loads would settle JAX's device and precision.
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
     control = js.Control(control.vertices, _given_normals(topology, control))
+    recipe = Recipe(
+        scheme,
+        len(topology.levels),
+        free,
+        priors,
+        loss,
+        max_sweeps,
+        tolerance,
+        topology.mesh_normals,
+        topology.limit is not None,
+    )
+    start = control
     surface = js.refine(scheme, topology, control)
     open_vertices, edge = boundary_vertices(surface), float(edge_length(topology, control.vertices))
     crowded = dense_points(np.asarray(scan.points)) if open_vertices.any() else np.ones(scan.n_points, bool)
@@ -141,6 +154,8 @@ def fit(
         result=result,
         problem=problem,
         seen=seen,
+        recipe=recipe,
+        start=start,
     )
     if throw and result != optx.RESULTS.successful:
         raise RuntimeError(

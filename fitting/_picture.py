@@ -42,7 +42,7 @@ def draw_fit(result: FitResult, start: js.ControlMesh, *, title: str = "") -> "F
     figure = Figure(figsize=(15, 9.5), layout="constrained", dpi=100)
     figure.suptitle(title, fontsize=14)
     (before, after, smooth), (error, counts, convergence) = figure.subplots(2, 3)
-    view, surface = _view(result.surface), result.surface
+    view, surface = view_of(result.surface), result.surface
     for ax, vertices, name in (
         (before, start.vertices, "control mesh at the start, and the scan"),
         (after, np.asarray(result.control.vertices), "control mesh fitted"),
@@ -72,7 +72,7 @@ def surface_distances(result: FitResult) -> Float[np.ndarray, "v"]:
     return np.where(known, result.distances[nearest].mean(axis=1), np.nan)
 
 
-def _view(surface: js.RefinedSurface) -> Float[np.ndarray, "3 3"]:
+def view_of(surface: js.RefinedSurface) -> Float[np.ndarray, "3 3"]:
     """Rows: right, up and towards the viewer, looking at an open surface's outside, or a closed one's broad side."""
     vertices, normals = np.asarray(surface.vertices), np.asarray(surface.normals)
     towards = np.average(normals, axis=0)

@@ -64,6 +64,18 @@ class _Equations(NamedTuple):
     by_bend: Float[np.ndarray, "b d"]
 
 
+class Found(NamedTuple):
+    """What makes a problem besides its options, and what the sweeps find out."""
+
+    template: Float[np.ndarray, "v 3"]
+    """Control vertices where the fit started, in mm."""
+    bend_precision: Float[np.ndarray, "f"]
+    """1 / variance of the bends, a control face; empty before the first sweep."""
+    determined: float
+    annealed: bool
+    anchors: Anchors | None
+
+
 class Problem:
     """What stays the same from sweep to sweep; and the strength of the bend prior, which the sweeps find."""
 
@@ -255,6 +267,19 @@ class Problem:
         """The structure, known after the first sweep."""
         assert self._elements is not None
         return self._elements
+
+    @property
+    def topology(self) -> js.Topology:
+        """Tables of the control mesh."""
+        return self._topology
+
+    def found(self) -> Found:
+        """What a problem made anew has to be told, to know as much as this one."""
+        return Found(self._template, self._precision, self.determined, self.annealed, self._anchors)
+
+    def tell(self, found: Found) -> None:
+        """Take over what the sweeps of another problem found."""
+        self._precision, self.determined, self.annealed = found.bend_precision, found.determined, found.annealed
 
     def _matrix(self, values: np.ndarray, diagonal: np.ndarray) -> sp.csc_array:
         pattern = self.elements.pattern

@@ -5,8 +5,24 @@ import json
 
 
 @dataclasses.dataclass(frozen=True)
+class WorstPlace:
+    """A place where the scan lies far from the fitted surface.
+
+    Attributes:
+        position: x, y, z on the surface, in mm.
+        distance: signed distance in mm, positive where the scan lies outside: the median of the nearest points, nine or
+            as many as lie within a quarter of a control edge on average, so that neither outliers nor noise make it.
+        n_points: how many scan points lie within half a control edge.
+    """
+
+    position: list[float]
+    distance: float
+    n_points: int
+
+
+@dataclasses.dataclass(frozen=True)
 class Report:
-    """The numbers of a fit; distances in mm, between scan points and the fitted surface.
+    """The numbers of a fit; distances in mm. They are from the scan's points to the surface where nothing else is said.
 
     Attributes:
         converged: whether the last sweeps left the fit where it was.
@@ -19,6 +35,19 @@ class Report:
         rms_inliers: root mean square distance of these.
         h: fitted tangent length coefficient, one or one a level; None where the scheme has none.
         rms_per_sweep: at the start, then after every sweep.
+        coverage: share of the surface's area that the scan covers: where an inlier is paired with a place nearer
+            than five times the median distance from such a place to the next, and not on the other side.
+        mean_to_scan, rms_to_scan, percentile_95_to_scan, maximum_to_scan: the other direction, of the absolute distance
+            from the surface to the scan where the scan covers it, every part of the surface by its area. It is a mean
+            over the eight nearest inliers, so that their noise mostly cancels and the misfit is left. None where the
+            scan covers nothing.
+        n_unknowns: numbers that the fit was free to change.
+        determined: about how many of these the scan determines, the rest being left to the priors.
+        least_margin: the least `admissible_margin` of the control normals: the surface is smooth above 0.05, and folds
+            below -0.2. None where the scheme does not look at normals.
+        uncertainty_median, uncertainty_95: median and 95th percentile, over the covered area, of the surface's standard
+            deviation; None where it was not asked for.
+        worst: up to five places where the scan lies farthest from the surface, one control edge apart.
     """
 
     converged: bool
@@ -39,8 +68,25 @@ class Report:
     n_faces: int
     h: float | list[float] | None
     rms_per_sweep: list[float]
+    coverage: float
+    mean_to_scan: float | None
+    rms_to_scan: float | None
+    percentile_95_to_scan: float | None
+    maximum_to_scan: float | None
+    n_unknowns: int
+    determined: float
+    least_margin: float | None
+    uncertainty_median: float | None
+    uncertainty_95: float | None
+    worst: list[WorstPlace]
 
     def __str__(self) -> str:
+        rows = self.as_rows()
+        width = max(len(name) for name, _ in rows)
+        return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
+
+    def as_rows(self) -> list[tuple[str, str]]:
+        """The same as names and values in words: a table of two columns."""
         state = f"converged after {self.sweeps} sweeps" if self.converged else f"NOT CONVERGED: {self.reason}"
         h = [] if self.h is None else self.h if isinstance(self.h, list) else [self.h]
         rows = [
@@ -51,15 +97,35 @@ class Report:
             ("bias (outside is positive)", f"{self.bias:+.3f} mm"),
             ("scan points", f"{self.n_points:,}, {self.inlier_share:.1%} within 3 x the noise of {self.noise:.3f} mm"),
             ("RMS of these", f"{self.rms_inliers:.3f} mm"),
+            ("surface covered by the scan", f"{self.coverage:.1%}"),
+        ]
+        to_scan = self.rms_to_scan, self.mean_to_scan, self.percentile_95_to_scan, self.maximum_to_scan
+        if None not in to_scan:
+            rows.append(
+                ("there, surface to scan", "RMS {:.3f}, mean {:.3f}, 95th {:.3f}, maximum {:.3f} mm".format(*to_scan))
+            )
+        if self.uncertainty_median is not None:
+            rows.append(
+                (
+                    "there, standard deviation",
+                    f"median {self.uncertainty_median:.3f}, 95th {self.uncertainty_95:.3f} mm",
+                )
+            )
+        rows += [
             ("control vertices", f"{self.n_control_vertices:,}"),
             ("faces of the surface", f"{self.n_faces:,}"),
+            ("unknowns", f"{self.n_unknowns:,}, about {self.determined:,.0f} determined by the scan"),
         ]
         if h:
             rows.append(("tangent length h", ", ".join(f"{value:.4f}" for value in h)))
-        if self.rms > self.rms_start:
-            rows.append(("note", "worse than the start: is the control mesh too coarse, or fairness too strong?"))
-        width = max(len(name) for name, _ in rows)
-        return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
+        if self.least_margin is not None:
+            rows.append(("least margin of a normal", f"{self.least_margin:+.2f}"))
+        for i, place in enumerate(self.worst):
+            at = ", ".join(f"{x:.1f}" for x in place.position)
+            rows.append((f"worst place {i + 1}", f"{place.distance:+.3f} mm at ({at}), {place.n_points:,} points"))
+        if self.rms_inliers > self.rms_start:
+            rows.append(("note", "worse than the start: is the control mesh too coarse for the scan?"))
+        return rows
 
     def as_dict(self) -> dict[str, object]:
         """The same as plain values."""

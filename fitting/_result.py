@@ -1,6 +1,7 @@
 """What a fit returns."""
 
 import functools
+import os
 from typing import final
 
 import numpy as np
@@ -9,11 +10,14 @@ from jaxtyping import Bool, Float
 
 import jaxsubdiv as js
 
+from ._coverage import distances_to_scan, vertex_areas, weighted_quantile, worst_places
+from ._free import edge_length
 from ._look import Look
 from ._posterior import Posterior, Uncertainty
 from ._problem import Problem
+from ._recipe import Recipe
 from ._refit import Refit, make_refit
-from ._report import Report
+from ._report import Report, WorstPlace
 from ._scan import Scan
 
 
@@ -35,6 +39,8 @@ class FitResult:
         noise: standard deviation in mm of the Gaussian part of the distances: the noise of the scan, and the detail
             that the control mesh is too coarse for.
         result: `optimistix.RESULTS.successful`, or why the fit stopped without having converged.
+        recipe: the settings that the fit was given, to fit the next scan in the same way.
+        start: the control where the fit started, with the normals that it took.
     """
 
     def __init__(
@@ -53,6 +59,8 @@ class FitResult:
         result: optx.RESULTS,
         problem: Problem,
         seen: Look,
+        recipe: Recipe | None = None,
+        start: js.Control | None = None,
     ):
         self.control = control
         self.scheme = scheme
@@ -65,6 +73,8 @@ class FitResult:
         self.robust_rms = robust_rms
         self.noise = noise
         self.result = result
+        self.recipe = recipe
+        self.start = start
         self._problem, self._seen = problem, seen
 
     @functools.cached_property
@@ -78,18 +88,53 @@ class FitResult:
         They say how far the surface may be off the anatomy because of noise, holes and few points; not how far it is
         where the control mesh is too coarse for it. Exact for up to 4,000 unknowns, else from random draws.
         """
+        return self._uncertainty
+
+    @functools.cached_property
+    def _uncertainty(self) -> Uncertainty:
         return self.posterior.uncertainty()
+
+    @functools.cached_property
+    def control_mesh(self) -> js.ControlMesh:
+        """The fitted control mesh with its normals, for `js.write_mesh`."""
+        return js.ControlMesh(
+            self.control.vertices, self._problem.topology.control_faces, self.control.normals, check=False
+        )
 
     def refit(self) -> Refit:
         """The fitted control as a differentiable function of scan points and weights; see `Refit`."""
         return make_refit(self.posterior)
 
+    def save(self, folder: str | os.PathLike[str]) -> None:
+        """Write the fit into a folder, made where there is none, for `fitting.load`; and its settings.
+
+        Of the two files `fit.npz` holds everything, scan and control mesh included, and `recipe.json` the settings, for
+        `fitting.load_recipe` and for people. Each is complete or not there.
+
+        Raises:
+            OSError: the folder cannot be made or written.
+            ValueError: the scheme or the loss is of a class of your own, or the control mesh has creases.
+        """
+        from ._saved import save  # which makes results itself
+
+        save(folder, self)
+
     @property
     def inliers(self) -> Bool[np.ndarray, "p"]:
         return np.abs(self.distances) <= 3 * self.noise
 
-    def report(self) -> Report:
-        """The fit in numbers: `print` it, or take `.as_dict()`."""
+    def report(self, *, uncertainty: bool = False) -> Report:
+        """The fit in numbers: `print` it, or take `.as_dict()`.
+
+        Args:
+            uncertainty: with that of the surface, which takes a second or more.
+        """
+        areas, to_scan = vertex_areas(self.surface), distances_to_scan(self.surface, self._seen, self.inliers)
+        covered = ~np.isnan(to_scan)
+        areas_there, away = areas[covered], np.abs(to_scan[covered])
+        known, share = bool(areas_there.sum() > 0), areas_there / max(areas_there.sum(), np.finfo(float).tiny)
+        spread = self.uncertainty().surface[covered] if uncertainty and known else None
+        edge = float(edge_length(self._problem.topology, self.control.vertices))
         return Report(
             converged=bool(self.result == optx.RESULTS.successful),
             reason=_words(self.result),
@@ -109,6 +154,20 @@ class FitResult:
             n_faces=self.surface.n_faces,
             h=None if self.scheme.h is None else np.asarray(self.scheme.h).tolist(),
             rms_per_sweep=[float(value) for value in self.rms],
+            coverage=float(areas_there.sum() / areas.sum()),
+            mean_to_scan=float(share @ away) if known else None,
+            rms_to_scan=float(np.sqrt(share @ away**2)) if known else None,
+            percentile_95_to_scan=weighted_quantile(away, share, 0.95) if known else None,
+            maximum_to_scan=float(away.max()) if known else None,
+            n_unknowns=int(self._problem.is_free.sum()),
+            determined=self._problem.determined,
+            least_margin=float(js.admissible_margin(self.control_mesh).min()) if self.scheme.uses_normals else None,
+            uncertainty_median=None if spread is None else weighted_quantile(spread, share, 0.5),
+            uncertainty_95=None if spread is None else weighted_quantile(spread, share, 0.95),
+            worst=[
+                WorstPlace(place.position.tolist(), place.distance, place.n_points)
+                for place in worst_places(self.surface, self._seen, self.distances, edge)
+            ],
         )
 
 

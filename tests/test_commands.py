@@ -203,7 +203,7 @@ def files(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-RESULTS = ["control.obj", "fit.png", "report.json", "surface.ply"]
+RESULTS = ["control.obj", "fit.html", "fit.npz", "fit.png", "recipe.json", "report.json", "surface.ply"]
 
 
 GIVEN = ("--control", "control.obj", "--levels", 1, "--align", "none")
@@ -220,7 +220,9 @@ def test_fit_of_files_is_that_of_the_library(files, capsys):
     assert "scan     600 points, " in out and "control  12 vertices, 14 faces, " in out
     assert "now      fits 12 control vertices" in out
     assert (
-        str(found.report()) in out and "wrote    control.obj, surface.ply, report.json, fit.png in deep/folder" in out
+        str(found.report(uncertainty=True)) in out
+        and "wrote    control.obj, surface.ply, report.json, fit.html, fit.npz, recipe.json, fit.png in deep/folder"
+        in out
     )
     assert names(files / "deep" / "folder") == RESULTS
     control = js.read_mesh("deep/folder/control.obj")
@@ -228,7 +230,7 @@ def test_fit_of_files_is_that_of_the_library(files, capsys):
     np.testing.assert_allclose(control.normals, found.control.normals, rtol=1e-9, atol=1e-12)
     surface = js.read_mesh("deep/folder/surface.ply")
     np.testing.assert_allclose(surface.vertices, found.surface.vertices, rtol=1e-9, atol=1e-9)
-    assert json.loads(Path("deep/folder/report.json").read_text()) == found.report().as_dict()
+    assert json.loads(Path("deep/folder/report.json").read_text()) == found.report(uncertainty=True).as_dict()
 
 
 @pytest.mark.parametrize(
@@ -360,7 +362,7 @@ def test_without_matplotlib_there_is_no_picture_but_all_the_rest(files, capsys, 
     for module in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, module, None)
     assert run(fit, "scan.xyz", *GIVEN, "--max-sweeps", 1, "-o", "out") == 1
-    assert names(files / "out") == ["control.obj", "report.json", "surface.ply"]
+    assert names(files / "out") == [name for name in RESULTS if name != "fit.png"]
     assert "note     no picture: " in capsys.readouterr().out
 
 

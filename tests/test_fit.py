@@ -549,7 +549,10 @@ def test_example_of_the_command_line_comes_back_within_a_third_of_a_millimetre(t
     assert start > 1.5 and 0 < end < 0.35
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "control.obj",
+        "fit.html",
+        "fit.npz",
         "fit.png",
+        "recipe.json",
         "report.json",
         "surface.ply",
     ]
