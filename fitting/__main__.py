@@ -275,8 +275,8 @@ def _parser() -> argparse.ArgumentParser:
         "SCAN it runs an example that ships with the package.",
         epilog="OUT gets control.obj (fitted control mesh with normals), surface.ply (refined surface, with the signed "
         "distance of the scan and the standard deviation of the surface in mm at every vertex), report.json, fit.html "
-        "(a page to turn the surface in, without a network), fit.png, and fit.npz and recipe.json for `fitting.load`; of "
-        "several scans, a folder each and summary.csv. Lengths are in mm. Exit status: 0 converged, 1 not "
+        "(a page to turn the surface in, without a network), fit.png, and fit.npz and recipe.json for `fitting.load`; "
+        "of several scans, a folder each and summary.csv. Lengths are in mm. Exit status: 0 converged, 1 not "
         "converged (files are written all the same), 2 an input cannot be used.",
     )
     add = parser.add_argument
