@@ -18,7 +18,7 @@ import jaxsubdiv as js
 Solve = Callable[[Float[np.ndarray, "n k"]], Float[np.ndarray, "n k"]]
 
 _PROBES = 24  # random vectors of a trace; a face's neighbourhood averages over hundreds of rows besides
-_SHARE_OF_ALL = 0.3  # how much the whole surface counts beside a face's neighbourhood
+_SHARE_OF_ALL = 0.05  # how much the whole surface counts beside a face's neighbourhood
 _TINY = np.finfo(float).tiny
 _LARGEST_CHANGE = 5.0  # of a strength in one sweep: what it depends on is known for the present one only
 

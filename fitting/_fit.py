@@ -18,8 +18,7 @@ from jaxsubdiv._surface import corner_weights
 from ._correspondence import boundary_vertices, closest_points
 from ._free import Free, apply_offset, edge_length
 from ._landmarks import Landmarks, place_landmarks
-from ._look import Look, look
-from ._outliers import dense_points
+from ._look import Look, look, surroundings
 from ._problem import Problem
 from ._recipe import Recipe
 from ._residuals import Anchors, Priors
@@ -114,8 +113,8 @@ def fit(
     start = control
     surface = js.refine(scheme, topology, control)
     open_vertices, edge = boundary_vertices(surface), float(edge_length(topology, control.vertices))
-    crowded = dense_points(np.asarray(scan.points)) if open_vertices.any() else np.ones(scan.n_points, bool)
-    seen = look(surface, scan, open_vertices, crowded, edge, loss, _LEAST_NOISE * edge)
+    around = surroundings(scan)
+    seen = look(surface, scan, open_vertices, around, edge, loss, _LEAST_NOISE * edge)
     widest = float(seen.scale)  # a robust scale of the start's own error: outliers must not widen it
     _warn_if_far(float(np.median(np.abs(seen.distances))), control)
     rms, robust_rms, result = [float(seen.rms)], [float(seen.robust_rms)], optx.RESULTS.nonlinear_max_steps_reached
@@ -130,7 +129,7 @@ def fit(
         moved = float(_moved(surface, refined))
         (scheme, control), surface = proposed, refined
         floor = max(widest * 0.5 ** (sweep + 1), _LEAST_NOISE * edge)
-        seen = look(surface, scan, open_vertices, crowded, edge, loss, floor)
+        seen = look(surface, scan, open_vertices, around, edge, loss, floor)
         rms.append(float(seen.rms))
         robust_rms.append(float(seen.robust_rms))
         if on_sweep is not None:

@@ -5,19 +5,23 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import KDTree
 
 import jaxsubdiv as js
 from jaxsubdiv._linalg import dot, norm, unit
 from jaxsubdiv._surface import corner_weights
 
-from ._correspondence import closest_points
+from ._correspondence import closest_points, nearest_rows
+from ._outliers import dense_points
 from ._residuals import Pairs
 from ._robust import AbstractLoss, noise_scale
 from ._scan import Scan
 
 _BOUNDARY_SCALE = 1 / 3  # least scale of the loss at an open boundary, in control edges
 _ON_BOUNDARY = 1e-3  # how far, in parts of a face, a surface point may lie from a boundary and count as on it
+_NEIGHBOURS = 9
+_CLEAN = 0.9  # of the points crowded: so few outliers that neighbours can be trusted
 _STEEPEST = 0.5  # height over length: by how much the anatomy may turn away beyond a boundary
 _ON_SURFACE = 1e-6  # in control edges: a point that is closer is on the surface, in no direction from it
 _LEAST_COSINE = 0.5  # between a scan's normal and the surface's: beyond 60 degrees it is the other side of something
@@ -43,11 +47,35 @@ class Look(NamedTuple):
     robust_rms: Float[Array, ""]
 
 
+class Surroundings(NamedTuple):
+    """What every scan point has around it."""
+
+    crowded: Bool[Array | np.ndarray, "p"]
+    """Whether other points are near, as they are not around scattered outliers."""
+    trusted: Bool[Array | np.ndarray, "p"]
+    """Whether what it has in common with its neighbours counts: in a scan of few scattered points, where crowded."""
+    neighbours: Int[Array | np.ndarray, "p k"]
+    """Rows of the nearest points, without itself."""
+
+
+def surroundings(scan: Scan) -> Surroundings:
+    """The surroundings of a scan, which stay what they are while the surface moves."""
+    counted = np.flatnonzero(np.asarray(scan.weights_or_ones()) > 0)  # the others are as if they were not there
+    points = np.asarray(scan.points)[counted]
+    crowded, neighbours = np.zeros(scan.n_points, bool), np.zeros((scan.n_points, 1), np.int32)
+    crowded[counted] = dense_points(points)
+    if len(counted) > 1:
+        _, rows = nearest_rows(KDTree(points), points, min(_NEIGHBOURS + 1, len(points)))
+        neighbours = np.zeros((scan.n_points, rows.shape[1] - 1), np.int32)
+        neighbours[counted] = counted[rows[:, 1:]]
+    return Surroundings(crowded, crowded & (crowded.sum() > _CLEAN * len(counted)), neighbours)
+
+
 def look(
     surface: js.RefinedSurface,
     scan: Scan,
     open_vertices: Bool[np.ndarray, "v"],
-    crowded: Bool[np.ndarray, "p"],
+    around: Surroundings,
     edge: float,
     loss: AbstractLoss,
     floor: float,
@@ -56,14 +84,14 @@ def look(
 
     Args:
         open_vertices: which vertices of the surface lie on a boundary.
-        crowded: points that have others around them, as scattered outliers have not.
+        around: of the scan's points, see `surroundings`.
         edge: length of a control edge in mm.
         loss: how a point loses weight with its distance.
         floor: the least scale of the loss in mm.
     """
     at = closest_points(surface, np.asarray(scan.points))
     edge_and_floor = (jnp.asarray(value, scan.points.dtype) for value in (edge, floor))
-    return _measure(surface, scan, at, open_vertices, crowded, *edge_and_floor, loss)
+    return _measure(surface, scan, at, open_vertices, around, *edge_and_floor, loss)
 
 
 @jax.jit
@@ -72,7 +100,7 @@ def _measure(
     scan: Scan,
     at: js.SurfacePoint,
     open_vertices: Bool[Array | np.ndarray, "v"],
-    crowded: Bool[Array | np.ndarray, "p"],
+    around: Surroundings,
     edge: Float[Array, ""],
     floor: Float[Array, ""],
     loss: AbstractLoss,
@@ -92,16 +120,22 @@ def _measure(
     # Near a boundary the surface may have to grow, by up to a control edge, to points that go on as it does: what is
     # farther is not covered by the mesh, and outliers lie there in all directions.
     at_its_scale = jnp.where(at_boundary, jnp.maximum(scale, edge * _BOUNDARY_SCALE), scale * spread)
-    weights = given * loss.weight(distance / at_its_scale)
+    signed = jnp.where(dot(normals, away)[:, 0] < 0, -distance, distance)
+    # What a point has in common with its neighbours is the surface's error, not the point's: a nose that the control
+    # mesh has yet to reach is no outlier. Where scattered points are many, they have neighbours of their own kind.
+    common = jnp.median(signed[around.neighbours], axis=1)
+    shared = around.trusted & (jnp.abs(common) < edge) & ~at_boundary
+    own = jnp.where(shared, jnp.minimum(distance, jnp.abs(signed - common)), distance)
+    weights = given * loss.weight(own / at_its_scale)
     across = jnp.abs(dot(normals, away))[:, 0]
-    goes_on = crowded & (distance < edge) & (across < 3 * scale * spread + _STEEPEST * distance)
+    goes_on = around.crowded & (distance < edge) & (across < 3 * scale * spread + _STEEPEST * distance)
     weights = jnp.where(at_boundary & ~goes_on, 0.0, weights)
     # The derivative of a distance is along it: across the face, or from the edge or boundary that is closest.
     directions = jnp.where(distance[:, None] > edge * _ON_SURFACE, unit(away), normals)
     return Look(
         at=at,
         pairs=Pairs(scan.points, corners, inside, directions),
-        distances=jnp.where(dot(normals, away)[:, 0] < 0, -distance, distance),
+        distances=signed,
         weights=weights,
         precisions=weights / jnp.mean(scan.weights_or_ones()) / (scale * spread) ** 2,
         noise=noise,

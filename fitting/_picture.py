@@ -131,7 +131,7 @@ def _draw_error(ax: Any, result: FitResult, view: Float[np.ndarray, "3 3"]) -> N
     from matplotlib.colors import Normalize
 
     surface, distances = result.surface, surface_distances(result)
-    limit = _limit(result, 98)
+    limit = _limit(result, 98.0)
     scale = Normalize(-limit, limit)
     at_faces = np.concatenate([distances[np.asarray(surface.faces[size])].mean(axis=1) for size in (3, 4)])
     known = ~np.isnan(at_faces)[:, None]
@@ -150,7 +150,7 @@ def _limit(result: FitResult, percentile: float) -> float:
 
 
 def _draw_counts(ax: Any, result: FitResult) -> None:
-    limit = 1.2 * _limit(result, 100)
+    limit = 1.2 * _limit(result, 100.0)
     ax.hist(np.clip(result.distances, -limit, limit), bins=80, color="tab:blue")
     ax.set_xlabel("signed distance, mm (the ends hold what is beyond)")
     ax.set_ylabel("scan points")

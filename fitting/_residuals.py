@@ -140,7 +140,7 @@ def bend_asymmetry(
         surface: the surface, or a coarser mesh.
         edges: default: those of the first level, or the control edges where there is one level only.
     """
-    a, b = (bend_edges(topology) if edges is None else edges).T
+    a, b = jnp.asarray(bend_edges(topology) if edges is None else edges).T
     d = take(surface.vertices, b) - take(surface.vertices, a)
     return 0.5 * dot(take(surface.normals, a) + take(surface.normals, b), d)[:, 0]
 
@@ -171,7 +171,7 @@ def _bends(start: Start, scheme: js.AbstractScheme, control: js.Control, surface
 
 
 def _stretch(start: Start, control: js.Control) -> Float[Array, "s"]:
-    a, b = start.edges.T
+    a, b = jnp.asarray(start.edges).T
 
     def along(rows: Float[Array, "v 3"]) -> Float[Array, "e 3"]:
         return take(rows, b) - take(rows, a)

@@ -21,7 +21,7 @@ from fitting import Free, Priors, Scan, ScanError, _fit
 from fitting.__main__ import main as fitting_command
 from fitting._elements import differentiate
 from fitting._free import apply_offset, no_offset, tangents
-from fitting._residuals import Pairs, Start, bend_asymmetry, bend_edges, residuals
+from fitting._residuals import Pairs, Start, bend_asymmetry, bend_edges, control_edges, residuals
 
 LOOSE = Priors(bend=10.0, stretch=10.0, h=10.0)
 """Priors that leave everything to the scan; where it says nothing they still hold the fit together."""
@@ -102,7 +102,8 @@ def two_points() -> Pairs:
 
 
 def start_of(scheme, topology, control, template=None) -> Start:
-    return Start(scheme, topology, control, control.vertices if template is None else jnp.asarray(template), None)
+    template = control.vertices if template is None else jnp.asarray(template)
+    return Start(scheme, topology, control, template, None, control_edges(topology), bend_edges(topology))
 
 
 def test_residuals_are_those_worked_out_by_hand():

@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 import fitting
 import jaxsubdiv as js
 from fitting._coverage import distances_to_scan, vertex_areas, weighted_quantile, worst_places
-from fitting._look import Look, look
+from fitting._look import Look, look, surroundings
 from fitting._page import write_page
 
 
@@ -59,7 +59,8 @@ def sphere_of_quads(n: int):
 
 def seen_from(surface: js.RefinedSurface, points: np.ndarray) -> tuple[Look, np.ndarray]:
     """Pairs and signed distances, without a fit."""
-    seen = look(surface, fitting.Scan(points), np.zeros(len(surface.vertices), bool), 8.0, fitting.Huber(), 1e-3)
+    scan, inside = fitting.Scan(points), np.zeros(len(surface.vertices), bool)
+    seen = look(surface, scan, inside, surroundings(scan), 8.0, fitting.Huber(), 1e-3)
     return seen, np.asarray(seen.distances)
 
 
