@@ -17,7 +17,7 @@ from ._free import Unknowns, apply_offset, no_offset
 from ._posterior import Posterior
 from ._residuals import Pairs, Rows, Start, residuals
 
-_MOST_STEPS = 50
+_MOST_STEPS = 200
 _TOLERANCE = 1e-8  # of the solution and of its derivative, in posterior standard deviations
 _MOST_UNKNOWNS = 8000  # whose posterior is whitened, in 512 MB
 
@@ -60,7 +60,8 @@ class Refit(eqx.Module):
 
         Raises:
             ValueError: another number of points than the scan has.
-            EquinoxRuntimeError: the points are so far from the scan's that there is no solution near the fit.
+            EquinoxRuntimeError: the solve does not converge: the points are too far from the scan's, or the residuals so
+                large beside the noise that the cost is not convex about the fit.
         """
         fixed = self._fixed
         if points.shape != fixed.pairs.points.shape:
@@ -68,11 +69,11 @@ class Refit(eqx.Module):
         weights = jnp.ones_like(points[:, 0]) if weights is None else weights
         found = optx.fixed_point(
             _newton_step,
-            optx.FixedPointIteration(rtol=0.0, atol=_TOLERANCE),
+            optx.FixedPointIteration(rtol=0.0, atol=_tolerance(points)),
             jnp.zeros(fixed.whitening.shape[1], points.dtype),
             args=(points, weights, fixed),
             # The Hessian is nearly the identity in these unknowns.
-            adjoint=optx.ImplicitAdjoint(linear_solver=lx.BiCGStab(rtol=_TOLERANCE, atol=_TOLERANCE)),
+            adjoint=optx.ImplicitAdjoint(linear_solver=lx.BiCGStab(rtol=_tolerance(points), atol=_tolerance(points))),
             max_steps=_MOST_STEPS,
         )
         offset, start = to_unknowns(fixed.whitening @ found.value, fixed.zero), fixed.start
@@ -80,8 +81,15 @@ class Refit(eqx.Module):
 
 
 def _newton_step(z: Float[Array, "u"], args: tuple[Array, Array, _Fixed]) -> Float[Array, "u"]:
-    """In whitened unknowns the Hessian is nearly the identity: a step down the gradient is nearly Newton's."""
-    return z - jax.grad(_cost)(z, *args)
+    """In whitened unknowns the Hessian is nearly the identity: a step down the gradient is nearly Newton's.
+
+    Half of it, so that curvature that the posterior leaves out, up to three times its own, does no harm.
+    """
+    return z - 0.5 * jax.grad(_cost)(z, *args)
+
+
+def _tolerance(points: Float[Array, "p 3"]) -> float:
+    return max(_TOLERANCE, 1e3 * float(jnp.finfo(points.dtype).eps))
 
 
 def _cost(
