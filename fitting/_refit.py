@@ -60,8 +60,8 @@ class Refit(eqx.Module):
 
         Raises:
             ValueError: another number of points than the scan has.
-            EquinoxRuntimeError: the solve does not converge: the points are too far from the scan's, or the residuals so
-                large beside the noise that the cost is not convex about the fit.
+            EquinoxRuntimeError: the solve does not converge: the points are too far from the scan's, or the residuals
+                so large beside the noise that the cost is not convex about the fit.
         """
         fixed = self._fixed
         if points.shape != fixed.pairs.points.shape:
