@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 import jaxsubdiv as js
 from jaxsubdiv._control import strong_float
-from jaxsubdiv._half_edges import half_edges
+from jaxsubdiv._half_edges import HalfEdges, half_edges
 from jaxsubdiv._linalg import cross, dot, norm, take, unit
 from jaxsubdiv._surface import sum_corners
 
@@ -154,7 +154,7 @@ def bend_edges(topology: js.Topology) -> Int[Array | np.ndarray, "b 2"]:
 
 def control_edges(topology: js.Topology) -> Int[np.ndarray, "e 2"]:
     """Edges of the control mesh, each once."""
-    return half_edges({size: np.asarray(faces) for size, faces in topology.control_faces.items()}).edges
+    return _sides(topology).edges
 
 
 def splits_in_four(topology: js.Topology) -> bool:
@@ -220,13 +220,13 @@ def prior_faces(
         owner: the control face of every face of the surface.
     """
     triangles, quads = (np.asarray(topology.control_faces[size]) for size in (3, 4))
-    of_edge = _faces_of_edges(control_edges(topology), triangles, quads)
+    sides = _sides(topology)
+    of_edge = np.zeros(len(sides.edges), int)
+    of_edge[sides.edge] = sides.face  # either of two will do
     bends = of_edge
     if len(bend_edges(topology)) != len(of_edge):
-        # As `build_topology` lays them out: halves of the parents' edges, three in a triangle, four in a quad.
-        inner = (np.repeat(np.arange(len(triangles)), 3), np.repeat(len(triangles) + np.arange(len(quads)), 4))
-        of_parent = _faces_of_edges(np.asarray(topology.levels[0].edges), triangles, quads)
-        bends = np.concatenate([np.repeat(of_parent, 2), *inner])
+        # As `build_topology` lays them out: halves of the control edges, three in a triangle, four in a quad.
+        bends = np.concatenate([np.repeat(of_edge, 2), sides.face])
     corners = [np.tile(np.arange(len(triangles)), 3), np.tile(len(triangles) + np.arange(len(quads)), 4)]
     return RowFaces(
         distance=np.zeros(0, int),
@@ -251,19 +251,6 @@ def control_faces_of(topology: js.Topology, surface: js.RefinedSurface, control:
     return np.asarray(tree.query(centres(surface.vertices, surface.faces))[1])
 
 
-def _faces_of_edges(
-    edges: Int[np.ndarray, "e 2"], triangles: Int[np.ndarray, "t 3"], quads: Int[np.ndarray, "q 4"]
-) -> Int[np.ndarray, "e"]:
-    """A face at every edge."""
-    sides = [np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2) for faces in (triangles, quads)]
-    owner = np.concatenate(
-        [np.repeat(np.arange(len(triangles)), 3), np.repeat(len(triangles) + np.arange(len(quads)), 4)]
-    )
-
-    def key(pairs: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
-        low_high = np.sort(pairs.astype(np.int64), axis=1)
-        return low_high[:, 0] << 32 | low_high[:, 1]
-
-    keys = key(np.concatenate(sides))
-    order = np.argsort(keys, kind="stable")
-    return owner[order[np.searchsorted(keys[order], key(edges))]]
+def _sides(topology: js.Topology) -> HalfEdges:
+    """Half-edges of the control mesh."""
+    return half_edges({size: np.asarray(faces) for size, faces in topology.control_faces.items()})
