@@ -1,42 +1,121 @@
-"""Row-wise vector algebra whose gradients are finite at every row.
+"""Vector algebra whose gradients are finite at every row, in two layouts.
 
-Vectors are the last axis, of length 3. Products are written out over the three coordinates: on XLA's CPU backend a
-reduction over an axis of 3 takes a slow path (about 3 times slower for a whole refinement).
+Rows hold the vectors in memory and between stages: the last axis, of length 3. `Vectors` hold the coordinates apart,
+and are what is computed with inside a stage: nothing is then broadcast or summed along an axis of 3, which XLA's CPU
+backend does slowly, and in a gradient twice so. Every function here takes either layout and gives back the same.
 """
 
-from typing import TypeAlias
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeAlias
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Float, Int
 
-Rows: TypeAlias = Float[Array, "*rows 3"]
+PerRow: TypeAlias = Float[Array, "*rows 1"]
 
 
-def take(rows: Float[Array, "v 3"], index: Int[Array, "*i"]) -> Float[Array, "*i 3"]:
+class Vectors(eqx.Module):
+    """Vectors with their coordinates apart."""
+
+    x: PerRow
+    y: PerRow
+    z: PerRow
+
+    def __add__(self, other: "Vectors") -> "Vectors":
+        return Vectors(self.x + other.x, self.y + other.y, self.z + other.z)
+
+    def __sub__(self, other: "Vectors") -> "Vectors":
+        return Vectors(self.x - other.x, self.y - other.y, self.z - other.z)
+
+    def __mul__(self, factor: Array | float) -> "Vectors":
+        return Vectors(self.x * factor, self.y * factor, self.z * factor)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, divisor: Array | float) -> "Vectors":
+        return Vectors(self.x / divisor, self.y / divisor, self.z / divisor)
+
+
+if TYPE_CHECKING:
+    Rows: TypeAlias = Any  # pyright sees no sums and products in a union
+else:
+    Rows: TypeAlias = Float[Array, "*rows 3"] | Vectors
+
+
+def apart(rows: Rows) -> Vectors:
+    """Rows as `Vectors`: a split and no slices, whose adjoint is one concatenation where those of slices are pads."""
+    return rows if isinstance(rows, Vectors) else Vectors(*lax.split(rows, (1, 1, 1), axis=rows.ndim - 1))
+
+
+def together(vectors: Rows) -> Float[Array, "*rows 3"]:
+    """`Vectors` as rows."""
+    if not isinstance(vectors, Vectors):
+        return vectors
+    return jnp.concatenate([vectors.x, vectors.y, vectors.z], axis=-1)
+
+
+def _like(given: Rows, found: Vectors) -> Any:
+    return found if isinstance(given, Vectors) else together(found)
+
+
+def take(rows: Float[Array, "v _"], index: Int[Array, "*i"]) -> Float[Array, "*i _"]:
     """`rows[index]`, without the wrap and clamp of indices: the tables are known to be in range."""
     return rows.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
-def dot(a: Rows, b: Rows) -> Float[Array, "*rows 1"]:
+def take_each(rows: Float[Array, "v _"], table: Int[Array, "m k"]) -> list[Float[Array, "1 m _"]]:
+    """The rows that each of the `k` columns of a table names: one gather, whose adjoint is one scatter."""
+    return list(lax.split(take(rows, table.T), (1,) * table.shape[1], axis=0))
+
+
+def kept_apart(stage: Callable) -> Callable:
+    """A stage of a refinement that XLA's CPU backend compiles as a program of its own.
+
+    Else it fuses a level into the gathers that read it, and computes every row again for each of its readers: 2 to 3
+    times slower forward, 2 times backward. A call that must not be inlined is kept in reverse and forward mode and
+    under `vmap`. What a gradient needs of the stage is computed again, and not kept.
+    """
+    called = jax.jit(jax.checkpoint(stage, prevent_cse=False))
+
+    def run(*arguments: Any) -> Any:
+        if jax.default_backend() != "cpu":
+            return called(*arguments)
+        with set_xla_metadata(inlineable="false"):
+            return called(*arguments)
+
+    return run
+
+
+def dot(a: Rows, b: Rows) -> PerRow:
     """Dot product of every row; the axis is kept, to multiply rows with."""
-    return a[..., 0:1] * b[..., 0:1] + a[..., 1:2] * b[..., 1:2] + a[..., 2:3] * b[..., 2:3]
+    a, b = apart(a), apart(b)
+    return a.x * b.x + a.y * b.y + a.z * b.z
 
 
-def cross(a: Rows, b: Rows) -> Rows:
+def cross(a: Rows, b: Rows) -> Any:
     """Cross product of every row."""
-    a0, a1, a2 = a[..., 0:1], a[..., 1:2], a[..., 2:3]
-    b0, b1, b2 = b[..., 0:1], b[..., 1:2], b[..., 2:3]
-    return jnp.concatenate([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
+    p, q = apart(a), apart(b)
+    return _like(a, Vectors(p.y * q.z - p.z * q.y, p.z * q.x - p.x * q.z, p.x * q.y - p.y * q.x))
 
 
-def largest(a: Rows) -> Float[Array, "*rows 1"]:
+def largest(a: Rows) -> PerRow:
     """Largest absolute coordinate of every row, without a gradient: a scale that cannot under- or overflow."""
-    a = jnp.abs(lax.stop_gradient(a))
-    return jnp.maximum(jnp.maximum(a[..., 0:1], a[..., 1:2]), a[..., 2:3])
+    a = apart(lax.stop_gradient(a))
+    return jnp.maximum(jnp.maximum(jnp.abs(a.x), jnp.abs(a.y)), jnp.abs(a.z))
 
 
-def unit_or(v: Rows, fallback: Rows | float, vanishes_below: Float[Array, "*rows 1"] | float = 0.0) -> Rows:
+def where(there: Array, a: Rows, b: Rows | float) -> Any:
+    """`a` in the rows that are there, else `b`."""
+    if isinstance(b, Vectors):
+        return jax.tree.map(lambda p, q: jnp.where(there, p, q), a, b)
+    return jax.tree.map(lambda p: jnp.where(there, p, b), a)
+
+
+def unit_or(v: Rows, fallback: Rows | float, vanishes_below: PerRow | float = 0.0) -> Any:
     """Unit vector of every row; `fallback` where the row vanishes.
 
     Args:
@@ -48,18 +127,21 @@ def unit_or(v: Rows, fallback: Rows | float, vanishes_below: Float[Array, "*rows
     Returns:
         Rows of length 1, or `fallback`. The gradient in a vanishing row of `v` is 0.
     """
+    if not isinstance(v, Vectors):
+        fallback = fallback if isinstance(fallback, float) else apart(jnp.broadcast_to(together(fallback), v.shape))
+        return together(unit_or(apart(v), fallback, vanishes_below))
     scale = largest(v)
-    there = scale > jnp.maximum(vanishes_below, jnp.finfo(v.dtype).tiny)
+    there = scale > jnp.maximum(vanishes_below, jnp.finfo(scale.dtype).tiny)
     # Guarded inside and outside of the root: one guard alone leaves NaN in the gradient of the other branch.
-    scaled = jnp.where(there, v, 1.0) / jnp.where(there, scale, 1.0)
-    return jnp.where(there, scaled / jnp.sqrt(dot(scaled, scaled)), fallback)
+    scaled = where(there, v, 1.0) / jnp.where(there, scale, 1.0)
+    return where(there, scaled / jnp.sqrt(dot(scaled, scaled)), fallback)
 
 
-def unit(v: Rows) -> Rows:
+def unit(v: Rows) -> Any:
     """Unit vector of every row; a zero row stays zero, with gradient 0."""
     return unit_or(v, 0.0)
 
 
-def norm(v: Rows) -> Float[Array, "*rows 1"]:
+def norm(v: Rows) -> PerRow:
     """Length of every row; the gradient at a zero row is 0."""
     return dot(v, unit(v))

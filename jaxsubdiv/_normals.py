@@ -1,7 +1,8 @@
 """Vertex normals from the faces around a vertex, eqs. (4)-(6), and the normals of edges."""
 
+import operator
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import Literal, TypeAlias
 
 import jax
@@ -10,14 +11,14 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ._fans import Fans
-from ._linalg import Rows, cross, dot, largest, take, unit, unit_or
+from ._linalg import Rows, Vectors, cross, dot, largest, take, unit, unit_or, where
 
 Weights: TypeAlias = Literal["area", "uniform", "angle", "sphere"]
 """How the corner normals around a vertex are weighed in (6)."""
 Boundary: TypeAlias = Literal["fan", "chord"]
 """Where the normal of a new boundary vertex comes from: the faces there are, or its edge."""
 
-Corners: TypeAlias = Float[Array, "k *rows 3"]
+Corners: TypeAlias = Float[Array, "k *rows 3"] | Vectors
 
 # A sum of cross products that is smaller than this many rounding errors of its terms has no direction of its own.
 _ROUNDING_ERRORS = 16
@@ -36,7 +37,8 @@ def corner_sum(a: Corners, b: Corners, weights: Weights) -> tuple[Rows, Float[Ar
     from facet normals, 1999.
     """
     normals = _WEIGH[weights](cross(a, b), a, b)
-    return normals.sum(axis=0), _rounding(largest(normals).sum(axis=0))
+    total = jax.tree.map(lambda corners: corners.sum(axis=0), normals)
+    return total, _rounding(largest(normals).sum(axis=0))
 
 
 def ring_sum(
@@ -55,18 +57,18 @@ def ring_sum(
         there: whether a neighbour and the next make a corner of a face; default: all do.
     """
     if weights != "area":
-        a = jnp.stack(ring) - centre[None]
-        b = jnp.roll(a, -1, axis=0)
+        a = jax.tree.map(lambda *rows: jnp.stack(rows), *(neighbour - centre for neighbour in ring))
+        b = jax.tree.map(lambda rows: jnp.roll(rows, -1, axis=0), a)
         if there is not None:  # compiled code may round two copies of one position apart, and make a corner of them
-            a, b = jnp.where(there, a, 0.0), jnp.where(there, b, 0.0)
+            a, b = where(there, a, 0.0), where(there, b, 0.0)
         return corner_sum(a, b, weights)
     first, rest = ring[0], ring[1:]
-    total, terms = jnp.zeros_like(centre), jnp.zeros_like(centre[..., :1])
-    for i in range(0, len(rest) - 1, 2):  # the quads (first, rest_i, rest_i+1, rest_i+2), each by its diagonals
-        across, along = rest[i + 1] - first, rest[i + 2] - rest[i]
-        total += cross(across, along)
-        terms += largest(across) * largest(along)
-    return total, _rounding(terms)
+    # The quads (first, rest_i, rest_i+1, rest_i+2), each by its diagonals.
+    across = [rest[i + 1] - first for i in range(0, len(rest) - 1, 2)]
+    along = [rest[i + 2] - rest[i] for i in range(0, len(rest) - 1, 2)]
+    pairs = list(zip(across, along, strict=True))
+    total = reduce(operator.add, (cross(a, b) for a, b in pairs))
+    return total, _rounding(reduce(operator.add, (largest(a) * largest(b) for a, b in pairs)))
 
 
 @partial(jax.jit, static_argnames="weights")
@@ -135,10 +137,11 @@ def _sphere(c: Corners, a: Corners, b: Corners) -> Corners:
     # is rounding alone drops its corners: the weight there has a gradient of 1 / e, which says nothing.
     a2, b2 = dot(a, a), dot(b, b)
     longest = lax.stop_gradient(jnp.maximum(a2, b2).max(axis=0, keepdims=True, initial=0.0))
-    e = jnp.finfo(c.dtype).eps
+    e = jnp.finfo(a2.dtype).eps
     there = lax.stop_gradient(jnp.minimum(a2, b2)) > (_ROUNDING_ERRORS * e) ** 2 * longest
-    c, a2, b2 = (jnp.where(there, rows, 1.0) / jnp.where(there, longest, 1.0) for rows in (c, a2, b2))
-    return jnp.where(there, c / ((a2 + e) * (b2 + e)), 0.0)
+    scale = jnp.where(there, longest, 1.0)
+    c, a2, b2 = where(there, c, 1.0) / scale, *(jnp.where(there, square, 1.0) / scale for square in (a2, b2))
+    return where(there, c / ((a2 + e) * (b2 + e)), 0.0)
 
 
 def _direction(c: Corners, a: Corners, b: Corners) -> Corners:

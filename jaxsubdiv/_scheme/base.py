@@ -4,11 +4,13 @@ from abc import abstractmethod
 from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from .._control import strong_float
-from .._linalg import largest, take, unit, unit_or
+from .._linalg import Rows, Vectors, apart, kept_apart, largest, take_each, together, unit, unit_or, where
 from .._masks import Matrix, as_masks, identity, stack
 from .._normals import Boundary, Weights, chord_normals, fan_normals, ring_sum
 from .._stage import Sides, Stage, hybrid_split, sides_of
@@ -20,21 +22,21 @@ OldNormals: TypeAlias = Literal["keep", "recompute"]
 class Edges(NamedTuple):
     """Both ends of every edge of a level: positions, and normals of length 1 or 0."""
 
-    x_a: Float[Array, "e 3"]
-    x_b: Float[Array, "e 3"]
-    n_a: Float[Array, "e 3"]
-    n_b: Float[Array, "e 3"]
+    x_a: Vectors
+    x_b: Vectors
+    n_a: Vectors
+    n_b: Vectors
 
     @property
-    def d(self) -> Float[Array, "e 3"]:
+    def d(self) -> Vectors:
         """The edge as a vector."""
         return self.x_b - self.x_a
 
 
-def gather_edges(level: Level, x: Float[Array, "v 3"], n: Float[Array, "v 3"]) -> Edges:
-    """Ends of the edges of `level`."""
-    a, b = level.edges[:, 0], level.edges[:, 1]
-    return Edges(take(x, a), take(x, b), take(n, a), take(n, b))
+def gather_edges(level: Level, values: Float[Array, "v 6"]) -> Edges:
+    """Ends of the edges of `level`, from the positions and normals side by side: one look-up an end."""
+    (x_a, n_a), (x_b, n_b) = (map(apart, lax.split(end, (3, 3), axis=2)) for end in take_each(values, level.edges))
+    return Edges(x_a, x_b, n_a, n_b)
 
 
 def tangent_length(h: object) -> Float[Array, "..."]:
@@ -131,7 +133,7 @@ class AbstractPointNormalScheme(AbstractScheme):
         return hybrid_split(stage)
 
     @abstractmethod
-    def edge_points(self, h: Float[Array, ""], edges: Edges) -> Float[Array, "e 3"]:
+    def edge_points(self, h: Float[Array, ""], edges: Edges) -> Vectors:
         """Positions of the edge vertices."""
 
     @abstractmethod
@@ -143,22 +145,97 @@ class AbstractPointNormalScheme(AbstractScheme):
         n: Float[Array, "v 3"],
         edges: Edges,
         edge_points: Float[Array, "e 3"],
-    ) -> Float[Array, "q 3"]:
+    ) -> Rows:
         """Positions of the face vertices, one in the middle of every quad."""
 
     def refine_level(
         self, h: Float[Array, ""] | None, level: Level, x: Float[Array, "v 3"], n: Float[Array, "v 3"], recompute: bool
     ) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
         assert h is not None
-        edges = gather_edges(level, x, n)
-        edge_points = self.edge_points(h, edges)
-        face_points = self.face_points(h, level, x, n, edges, edge_points)
+        values = jnp.concatenate([x, n], axis=1)
+        edge_points = _edge_points(self, h, level, values)
+        face_points = _face_points(self, h, level, x, n, values, edge_points)
         refined = jnp.concatenate([x, edge_points, face_points])
-        edge_normals, face_normals = new_normals(self, level, edges, n, refined)
+        edge_normals = _unit_normals(_edge_normal_sums(self, level, values, refined), n, level.edges)
+        face_normals = _unit_normals(_face_normal_sums(self, level, edge_points, face_points), n, level.quads)
         if recompute:
             assert level.old_fans is not None  # see `_check` in `_refine`
             n = fan_normals(level.old_fans, x, refined, n, self.weights)
         return refined, jnp.concatenate([n, edge_normals, face_normals])
+
+
+# The stages of a level. Each runs over the edges or the quads once.
+
+
+@kept_apart
+def _edge_points(
+    scheme: AbstractPointNormalScheme, h: Float[Array, ""], level: Level, values: Float[Array, "v 6"]
+) -> Float[Array, "e 3"]:
+    return together(scheme.edge_points(h, gather_edges(level, values)))[0]
+
+
+@kept_apart
+def _face_points(
+    scheme: AbstractPointNormalScheme,
+    h: Float[Array, ""],
+    level: Level,
+    x: Float[Array, "v 3"],
+    n: Float[Array, "v 3"],
+    values: Float[Array, "v 6"],
+    edge_points: Float[Array, "e 3"],
+) -> Float[Array, "q 3"]:
+    return together(scheme.face_points(h, level, x, n, gather_edges(level, values), edge_points))[0]
+
+
+@kept_apart
+def _edge_normal_sums(
+    scheme: AbstractPointNormalScheme, level: Level, values: Float[Array, "v 6"], refined: Float[Array, "w 3"]
+) -> Float[Array, "e 4"]:
+    """Eq. (6) around every edge vertex of the refined mesh, and how much of it is rounding."""
+    n_old, n_edges = values.shape[0], level.edges.shape[0]
+    edges = gather_edges(level, values)
+    wings = [apart(rows) for rows in take_each(refined, level.wings)]
+    half = len(wings) // 2
+    ring = [edges.x_b, *wings[:half], edges.x_a, *wings[half:]]
+    centre = apart(refined[None, n_old : n_old + n_edges])
+    total, rounding = ring_sum(centre, ring, scheme.weights, ring_corners(level, n_old))
+    if scheme.boundary == "chord":
+        chord = chord_normals(edges.n_a, edges.n_b, edges.d)
+        takes_chord = is_boundary(level, n_old) & (largest(chord) > 0)
+        total, rounding = where(takes_chord, chord, total), jnp.where(takes_chord, 0.0, rounding)
+    return jnp.concatenate([*jax.tree.leaves(total), rounding], axis=-1)[0]
+
+
+@kept_apart
+def _face_normal_sums(
+    scheme: AbstractPointNormalScheme,
+    level: Level,
+    edge_points: Float[Array, "e 3"],
+    face_points: Float[Array, "q 3"],
+) -> Float[Array, "q 4"]:
+    """The same around the face vertices."""
+    spokes = [apart(rows) for rows in take_each(edge_points, level.quad_edges)]
+    total, rounding = ring_sum(apart(face_points[None]), spokes, scheme.weights)
+    return jnp.concatenate([*jax.tree.leaves(total), rounding], axis=-1)[0]
+
+
+@kept_apart
+def _unit_normals(sums: Float[Array, "m 4"], n: Float[Array, "v 3"], parents: Int[Array, "m k"]) -> Float[Array, "m 3"]:
+    """Unit normals, eq. (6); where the sum vanishes: the unit sum of the parents' normals."""
+    *total, rounding = lax.split(sums, (1, 1, 1, 1), axis=1)
+    total = Vectors(*total)
+    there = largest(total) > jnp.maximum(rounding, jnp.finfo(sums.dtype).tiny)
+
+    def of_parents(n: Float[Array, "v 3"]) -> Float[Array, "m 3"]:
+        first, *others = take_each(n, parents)
+        return unit(sum(others, first))[0]
+
+    def of_nobody(n: Float[Array, "v 3"]) -> Float[Array, "m 3"]:
+        return jnp.zeros((sums.shape[0], 3), n.dtype)
+
+    # The parents are looked up only where some sum vanishes: in most meshes none does.
+    instead = lax.cond(jnp.all(there), of_nobody, jax.checkpoint(of_parents), n)
+    return together(unit_or(total, apart(instead), rounding))
 
 
 class AbstractLinearScheme(AbstractScheme):
@@ -216,42 +293,14 @@ class AbstractPrimalScheme(AbstractLinearScheme):
         return hybrid_split(stage)
 
 
-def new_normals(
-    scheme: AbstractPointNormalScheme, level: Level, edges: Edges, n: Float[Array, "v 3"], x: Float[Array, "w 3"]
-) -> tuple[Float[Array, "e 3"], Float[Array, "q 3"]]:
-    """Unit normals of the edge vertices and of the face vertices, eqs. (4)-(6) on the refined faces around them.
-
-    Where the sum vanishes: the unit sum of the parents' normals.
-
-    Args:
-        n: normals of the old vertices.
-        x: positions of old and new vertices.
-    """
-    n_old, n_edges = n.shape[0], level.edges.shape[0]
-    edge_points, face_points = x[n_old : n_old + n_edges], x[n_old + n_edges :]
-
-    wings = [take(x, column) for column in level.wings.T]
-    half = len(wings) // 2
-    ring = [edges.x_b, *wings[:half], edges.x_a, *wings[half:]]
-    total, rounding = ring_sum(edge_points, ring, scheme.weights, ring_corners(level, n_old))
-    if scheme.boundary == "chord":
-        chord = chord_normals(edges.n_a, edges.n_b, edges.d)
-        takes_chord = is_boundary(level, n_old) & (largest(chord) > 0)
-        total, rounding = jnp.where(takes_chord, chord, total), jnp.where(takes_chord, 0.0, rounding)
-    edge_normals = unit_or(total, unit(edges.n_a + edges.n_b), rounding)
-
-    spokes = [take(edge_points, column) for column in level.quad_edges.T]
-    total, rounding = ring_sum(face_points, spokes, scheme.weights)
-    return edge_normals, unit_or(total, unit(corner_total(level, n)), rounding)
-
-
-def is_boundary(level: Level, n_old: int) -> Bool[Array, "e 1"]:
+def is_boundary(level: Level, n_old: int) -> Bool[Array, "1 e 1"]:
     """Whether an edge has one face only: its edge vertex then stands in its own ring."""
     n_edges = level.edges.shape[0]
-    return level.wings[:, -1:] == n_old + jnp.arange(n_edges, dtype=level.wings.dtype)[:, None]
+    itself = n_old + jnp.arange(n_edges, dtype=level.wings.dtype)
+    return (level.wings[:, -1] == itself)[None, :, None]
 
 
-def ring_corners(level: Level, n_old: int) -> Bool[Array, "k e 1"]:
+def ring_corners(level: Level, n_old: int) -> Bool[Array, "k 1 e 1"]:
     """Whether each neighbour of an edge vertex and the next are in one face.
 
     They are not where the ring stays at a quad's centre, nor where, on a boundary, it runs through the edge vertex.
@@ -260,10 +309,10 @@ def ring_corners(level: Level, n_old: int) -> Bool[Array, "k e 1"]:
     ring = jnp.stack([level.edges[:, 1], *level.wings.T[:half], level.edges[:, 0], *level.wings.T[half:]])
     itself = n_old + jnp.arange(ring.shape[1], dtype=ring.dtype)[None]
     after = jnp.roll(ring, -1, axis=0)
-    return ((ring != after) & (ring != itself) & (after != itself))[..., None]
+    return ((ring != after) & (ring != itself) & (after != itself))[:, None, :, None]
 
 
-def corner_total(level: Level, values: Float[Array, "v 3"]) -> Float[Array, "q 3"]:
+def corner_total(level: Level, values: Float[Array, "v 3"]) -> Float[Array, "1 q 3"]:
     """Sum of a value over the corners of every quad."""
-    a, b, c, d = (take(values, column) for column in level.quads.T)
+    a, b, c, d = take_each(values, level.quads)
     return (a + b) + (c + d)

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linalg import Rows, dot, take
+from .._linalg import Rows, Vectors, apart, dot, take_each, together
 from .._normals import Boundary, Weights, chord_normals
 from .._topology import Level
 from .base import AbstractPointNormalScheme, Edges, tangent_length
@@ -52,7 +52,7 @@ class CirclePreserving(AbstractPointNormalScheme):
     boundary: Boundary = eqx.field(static=True, default="chord", init=False)
     order: ClassVar[int] = 4
 
-    def edge_points(self, h: Float[Array, ""], edges: Edges) -> Float[Array, "e 3"]:
+    def edge_points(self, h: Float[Array, ""], edges: Edges) -> Vectors:
         return arc_rule(h, *edges)
 
     def face_points(
@@ -63,10 +63,10 @@ class CirclePreserving(AbstractPointNormalScheme):
         n: Float[Array, "v 3"],
         edges: Edges,
         edge_points: Float[Array, "e 3"],
-    ) -> Float[Array, "q 3"]:
-        edge_normals = chord_normals(edges.n_a, edges.n_b, edges.d)
-        q_ij, q_jk, q_kl, q_li = (take(edge_points, column) for column in level.quad_edges.T)
-        n_ij, n_jk, n_kl, n_li = (take(edge_normals, column) for column in level.quad_edges.T)
+    ) -> Vectors:
+        edge_normals = together(chord_normals(edges.n_a, edges.n_b, edges.d))[0]
+        q_ij, q_jk, q_kl, q_li = map(apart, take_each(edge_points, level.quad_edges))
+        n_ij, n_jk, n_kl, n_li = map(apart, take_each(edge_normals, level.quad_edges))
         a, b = arc_rule(h, q_ij, q_kl, n_ij, n_kl), arc_rule(h, q_jk, q_li, n_jk, n_li)
         n_a, n_b = chord_normals(n_ij, n_kl, q_kl - q_ij), chord_normals(n_jk, n_li, q_li - q_jk)
         return arc_rule(h, a, b, n_a, n_b)

@@ -5,7 +5,7 @@ from typing import ClassVar, Literal, TypeAlias, get_args
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .._linalg import Rows, dot, take
+from .._linalg import PerRow, Rows, Vectors, dot, take_each
 from .._normals import Boundary, Weights
 from .._topology import Level
 from .base import AbstractPointNormalScheme, Edges, OldNormals, check_option, corner_total, tangent_length
@@ -13,7 +13,7 @@ from .base import AbstractPointNormalScheme, Edges, OldNormals, check_option, co
 Twist: TypeAlias = Literal["zero", "printed"]
 
 
-def edge_rule(h: Float[Array, ""] | Float[Array, "*rows 1"], x_a: Rows, x_b: Rows, n_a: Rows, n_b: Rows) -> Rows:
+def edge_rule(h: Float[Array, ""] | PerRow, x_a: Rows, x_b: Rows, n_a: Rows, n_b: Rows) -> Rows:
     """Point in the middle of an edge, eqs. (1) and (2).
 
     With the tangents m_ab = h (d - (n_a.d) n_a) and m_ba = -h (d - (n_b.d) n_b), d = b - a, eq. (2),
@@ -26,15 +26,15 @@ def edge_rule(h: Float[Array, ""] | Float[Array, "*rows 1"], x_a: Rows, x_b: Row
         n_a, n_b: unit normals at the ends, or zeros.
     """
     d = x_b - x_a
-    return 0.5 * (x_a + x_b) + (h / 8) * (dot(n_b, d) * n_b - dot(n_a, d) * n_a)
+    return 0.5 * (x_a + x_b) + ((h / 8 * dot(n_b, d)) * n_b - (h / 8 * dot(n_a, d)) * n_a)
 
 
-def coons_centre(level: Level, x: Float[Array, "v 3"], edge_points: Float[Array, "e 3"]) -> Float[Array, "q 3"]:
+def coons_centre(level: Level, x: Float[Array, "v 3"], edge_points: Float[Array, "e 3"]) -> Float[Array, "1 q 3"]:
     """Middle of the Coons patch between four edges: half the sum of the edge points less a quarter of the corners'.
 
     It is eq. (3) with zero twist vectors, 1/4 sum P + 1/16 sum m, with the tangents m put in terms of the edge points.
     """
-    a, b, c, d = (take(edge_points, column) for column in level.quad_edges.T)
+    a, b, c, d = take_each(edge_points, level.quad_edges)
     return 0.5 * ((a + b) + (c + d)) - 0.25 * corner_total(level, x)
 
 
@@ -75,7 +75,7 @@ class Interpolating(AbstractPointNormalScheme):
     def recomputes_normals(self) -> bool:
         return self.old_normals == "recompute"
 
-    def edge_points(self, h: Float[Array, ""], edges: Edges) -> Float[Array, "e 3"]:
+    def edge_points(self, h: Float[Array, ""], edges: Edges) -> Vectors:
         return edge_rule(h, *edges)
 
     def face_points(
@@ -86,9 +86,9 @@ class Interpolating(AbstractPointNormalScheme):
         n: Float[Array, "v 3"],
         edges: Edges,
         edge_points: Float[Array, "e 3"],
-    ) -> Float[Array, "q 3"]:
+    ) -> Float[Array, "1 q 3"]:
         centre = coons_centre(level, x, edge_points)
         if self.twist == "zero":
             return centre
-        i, j, k, l = (take(n, column) for column in level.quads.T)  # noqa: E741  # the paper's names
+        i, j, k, l = take_each(n, level.quads)  # noqa: E741  # the paper's names
         return centre + (i - j + k - l) / 64
