@@ -26,6 +26,8 @@ from ._scheme.doo_sabin import DooSabin as DooSabin
 from ._scheme.interpolating import Interpolating as Interpolating
 from ._scheme.kobbelt import Kobbelt as Kobbelt
 from ._scheme.loop import Loop as Loop
+from ._seams import SplitMesh as SplitMesh
+from ._seams import split_normals as split_normals
 from ._stencils import interpolating_control as interpolating_control
 from ._stencils import stencils as stencils
 from ._surface import PointsAndNormals as PointsAndNormals

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._control import strong_float
-from .._linalg import largest, take, unit, unit_or
+from .._linalg import Rows, largest, take, unit, unit_or
 from .._masks import Matrix, as_masks, identity, stack
 from .._normals import Boundary, Weights, chord_normals, fan_normals, ring_sum
 from .._stage import Sides, Stage, hybrid_split, sides_of
 from .._topology import AbstractLevel, Level, LimitMasks, MaskLevel, point_normal_level
+from .seams import on_seams
 
 OldNormals: TypeAlias = Literal["keep", "recompute"]
 
@@ -75,6 +76,8 @@ class AbstractScheme(eqx.Module):
     """Whether the vertices of a level are the first of the next one, moved or not."""
     takes_creases: ClassVar[bool] = False
     """Whether `build_topology` may be given creases."""
+    takes_seams: ClassVar[bool] = False
+    """Whether `build_topology` may be given seams."""
     order: ClassVar[int]
     """Power of the edge length by which the first new vertices come closer to a smooth surface through the control
     vertices (with its own normals), on regular meshes."""
@@ -119,6 +122,7 @@ class AbstractPointNormalScheme(AbstractScheme):
     interpolates: ClassVar[bool] = True
     is_linear: ClassVar[bool] = False
     uses_normals: ClassVar[bool] = True
+    takes_seams: ClassVar[bool] = True
 
     @property
     def tables_for(self) -> str:
@@ -146,12 +150,18 @@ class AbstractPointNormalScheme(AbstractScheme):
     ) -> Float[Array, "q 3"]:
         """Positions of the face vertices, one in the middle of every quad."""
 
+    def seam_factor(self, t_a: Rows, t_b: Rows) -> Float[Array, "*rows 1"] | float:
+        """Factor of the tangents at both ends of a seam, which run from the first end to the second."""
+        return 1.0
+
     def refine_level(
         self, h: Float[Array, ""] | None, level: Level, x: Float[Array, "v 3"], n: Float[Array, "v 3"], recompute: bool
     ) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
         assert h is not None
         edges = gather_edges(level, x, n)
         edge_points = self.edge_points(h, edges)
+        if level.seams is not None:
+            edge_points = on_seams(level, x, n, edge_points, h, self.seam_factor)
         face_points = self.face_points(h, level, x, n, edges, edge_points)
         refined = jnp.concatenate([x, edge_points, face_points])
         edge_normals, face_normals = new_normals(self, level, edges, n, refined)
