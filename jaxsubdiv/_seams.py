@@ -75,9 +75,7 @@ def split_normals(mesh: ControlMesh, edges: Numbers | None = None, *, angle: flo
         return SplitMesh(split, origin)
     several = np.bincount(origin)[origin] > 1
     own = np.asarray(split.control().normals, np.float64)
-    return SplitMesh(
-        ControlMesh(split.vertices, faces, np.where(several[:, None], own, mesh.normals[origin])), origin
-    )
+    return SplitMesh(ControlMesh(split.vertices, faces, np.where(several[:, None], own, mesh.normals[origin])), origin)
 
 
 def _turned(mesh: ControlMesh, stage: Stage, sides: Sides) -> Float[np.ndarray, "e"]:

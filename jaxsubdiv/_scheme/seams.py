@@ -5,7 +5,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linalg import Rows, dot, take
+from .._linalg import Rows, dot, largest, take
 from .._topology import Level
 
 # Two normals that are closer than this (in length, about a degree) fade into one: so close, the direction at right
@@ -59,6 +59,12 @@ def on_seams(
     d = b - a
     n_a = along_normals(d, take(n, one[:, 0]), take(n, other[:, 1]))  # the sides run opposite ways
     n_b = along_normals(d, take(n, one[:, 1]), take(n, other[:, 0]))
-    points = 0.5 * (a + b) + (h / 8) * factor(d - n_a, d - n_b) * (n_b - n_a)
+    t_a, t_b = (_without_rounding(d - part, d) for part in (n_a, n_b))
+    points = 0.5 * (a + b) + (h / 8) * factor(t_a, t_b) * (n_b - n_a)
     # Computed once and put in twice: computed twice, compiled code may round the two sides apart.
     return edge_points.at[level.seams.reshape(-1)].set(jnp.repeat(points, 2, axis=0), mode="promise_in_bounds")
+
+
+def _without_rounding(t: Rows, d: Rows) -> Rows:
+    """Zero where nothing but rounding is left of `d`: that has no direction."""
+    return jnp.where(largest(t) > 16 * jnp.finfo(d.dtype).eps * largest(d), t, 0.0)
