@@ -58,7 +58,7 @@ def draw_surface(
     edges: bool = False,
     stripes: bool = False,
     frame: Numbers | None = None,
-    pixels: int = 480,
+    pixels: int = 400,
 ) -> Any:
     """Draw a surface as it is seen from afar, into axes that then have the unit of the surface.
 
@@ -130,10 +130,9 @@ def draw_surface(
 
     image = np.zeros((seen.height * seen.width, 4))
     image[seen.pixel, :3], image[seen.pixel, 3] = np.clip(colours, 0, 1), 1
-    image = image.reshape(seen.height // _FINER, _FINER, seen.width // _FINER, _FINER, 4)
-    cover = image[..., 3].sum(axis=(1, 3))
-    mean = image[..., :3].sum(axis=(1, 3)) / np.maximum(cover, 1)[..., None]
-    image = np.concatenate([mean, (cover / _FINER**2)[..., None]], axis=2)
+    image = image.reshape(seen.height, seen.width, 4)
+    image = sum(image[i::_FINER, j::_FINER] for i in range(_FINER) for j in range(_FINER)) / _FINER**2
+    image[..., :3] /= np.where(image[..., 3:] > 0, image[..., 3:], 1)
     ax.imshow(image, extent=frame, origin="lower", interpolation="antialiased")
     ax.axis("off")
     return mappable
@@ -153,41 +152,59 @@ class _Seen(NamedTuple):
 
 
 def _rasterise(corners: Float[np.ndarray, "t 3 3"], frame: Numbers, samples: int) -> _Seen:
-    """The nearest triangle at every sample: all samples in the box around each triangle are tried, all at once."""
+    """The nearest triangle at every sample: each triangle's rows of samples, then the samples from side to side."""
     left, right, bottom, top = frame
     scale = samples / max(right - left, top - bottom)
     # Whole pixels; the picture is stretched by less than one.
     width, height = (_FINER * max(1, round(scale * side / _FINER)) for side in (right - left, top - bottom))
     flat = (corners[..., :2] - (left, bottom)) * (width / (right - left), height / (top - bottom)) - 0.5
-    first = np.maximum(np.ceil(flat.min(axis=1)).astype(int), 0)
-    last = np.minimum(np.floor(flat.max(axis=1)).astype(int), (width - 1, height - 1))
-    a, b, c = np.moveaxis(flat, 1, 0)
-    doubled = _cross2(b - a, c - a)
-    sides = np.where((doubled != 0)[:, None], np.maximum(last - first + 1, 0), 0)
-    counts = sides.prod(axis=1)
-    triangle = np.repeat(np.arange(len(corners)), counts)
-    place = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    row, column = np.divmod(place, np.maximum(sides[triangle, 0], 1))
-    at = first[triangle] + np.stack([column, row], axis=1)
-    of_b = _cross2(at - a[triangle], (c - a)[triangle]) / doubled[triangle]
-    of_c = _cross2((b - a)[triangle], at - a[triangle]) / doubled[triangle]
-    weights = np.stack([1 - of_b - of_c, of_b, of_c], axis=1)
-    inside = (weights >= 0).all(axis=1)
-    triangle, weights, pixel = triangle[inside], weights[inside], (at[:, 1] * width + at[:, 0])[inside]
-    depth = np.einsum("pk,pk->p", weights, corners[triangle, :, 2])
+    # Barycentric coordinates as p x + q y + r, a row for every corner.
+    x, y = np.moveaxis(flat, (2, 1), (0, 1))
+    p, q = np.roll(y, -1, axis=0) - np.roll(y, -2, axis=0), np.roll(x, -2, axis=0) - np.roll(x, -1, axis=0)
+    doubled = p[0] * x[0] + q[0] * y[0] - (p[0] * x[1] + q[0] * y[1])
+    p, q = p / np.where(doubled == 0, np.nan, doubled), q / np.where(doubled == 0, np.nan, doubled)
+    r = -(p * np.roll(x, -1, axis=0) + q * np.roll(y, -1, axis=0))
+
+    first = np.maximum(np.ceil(y.min(axis=0)), 0).astype(int)
+    last = np.minimum(np.floor(y.max(axis=0)), height - 1).astype(int)
+    of_row, y = _counted(first, np.where(doubled == 0, first - 1, last))
+    p_row, rest = p[:, of_row], q[:, of_row] * y + r[:, of_row]
+    crossing = -rest / np.where(p_row == 0, np.nan, p_row)
+    start = np.where(p_row > 0, crossing, -np.inf).max(axis=0)
+    stop = np.where(p_row < 0, crossing, np.inf).min(axis=0)
+    # Rounding must not open gaps between neighbours.
+    start = np.ceil(np.clip(start - 1e-9, 0, width)).astype(int)
+    stop = np.floor(np.clip(stop + 1e-9, -1, width - 1)).astype(int)
+    row, x = _counted(start, stop)
+    triangle, y = of_row[row], y[row]
+
+    by_x, by_y, at_0 = ((part * corners[..., 2].T).sum(axis=0) for part in (p, q, r))  # depths are as linear
+    depth = by_x[triangle] * x + by_y[triangle] * y + at_0[triangle]
+    pixel = y * width + x
     nearest = np.full(width * height, -np.inf)
     np.maximum.at(nearest, pixel, depth)
     shown = np.flatnonzero(depth == nearest[pixel])
-    return _Seen(pixel[shown], triangle[shown], weights[shown], width, height, scale)
+    triangle, x, y = triangle[shown], x[shown], y[shown]
+    weights = (p[:, triangle] * x + q[:, triangle] * y + r[:, triangle]).T
+    return _Seen(pixel[shown], triangle, weights, width, height, scale)
+
+
+def _counted(first: Int[np.ndarray, "n"], last: Int[np.ndarray, "n"]) -> tuple[np.ndarray, np.ndarray]:
+    """All whole numbers from `first` to `last` of every row, and the row of each."""
+    counts = np.maximum(last - first + 1, 0)
+    row = np.repeat(np.arange(len(counts)), counts)
+    return row, np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts) + first[row]
 
 
 def _lit(
     colours: Float[np.ndarray, "p 3"], normal: Float[np.ndarray, "p 3"], strength: float
 ) -> Float[np.ndarray, "p 3"]:
     """Two lights and a soft shine; with less strength colours stay what they are."""
-    key, fill, shine = (np.clip(normal @ light, 0, 1) for light in (_KEY, _FILL, _SHINE))
+    key, fill, shine = np.clip(np.einsum("px,lx->lp", normal, (_KEY, _FILL, _SHINE)), 0, 1)
     light = 1 + strength * (0.36 + 0.62 * key + 0.14 * fill - 1)
-    return colours * light[:, None] + (0.1 * strength * shine**30)[:, None]
+    for _ in range(5):
+        shine = shine * shine
+    return colours * light[:, None] + (0.1 * strength * shine)[:, None]
 
 
 def _edge_cover(
