@@ -25,17 +25,14 @@ import jaxsubdiv as js
 from jaxsubdiv._compare import SCHEMES
 
 CONTROL = {3: "head_tri.obj", 4: "head_quad.obj"}  # triangles for the schemes that take nothing else
-LEVELS = 3
-DOO_SABIN_LEVELS = 2  # its vertices grow as those of the others, and its polygons are cut in triangles on top
 COLUMNS = ("rms", "p95", "truth_rms", "normals", "sweeps", "converged", "seconds")
 HEADINGS = ("scan, RMS", "95th percentile", "truth, RMS", "normals, deg", "sweeps", "converged", "seconds")
 
 
-def row(name: str, data: Path, truth: Trimesh, points: np.ndarray) -> dict:
+def row(name: str, data: Path, truth: Trimesh, points: np.ndarray, levels: int) -> dict:
     """Fit one scheme. Distances of the scan from the surface; surface and truth both ways, pooled."""
     scheme = SCHEMES[name]()
     mesh = js.read_mesh(data / "control" / CONTROL[4 if 4 in scheme.takes else 3])
-    levels = LEVELS if scheme.is_primal else DOO_SABIN_LEVELS
     start = time.perf_counter()
     topology = js.build_topology(mesh, scheme, levels)
     found = fitting.fit(scheme, topology, mesh.control(), fitting.Scan(points), throw=False)
@@ -77,6 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--schemes", nargs="+", choices=SCHEMES, default=list(SCHEMES), metavar="SCHEME", help=", ".join(SCHEMES)
     )
     parser.add_argument("--points", type=int, default=10_000, help="of the scan (default: %(default)s)")
+    parser.add_argument("--levels", type=int, default=3, help="of every scheme (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the points (default: %(default)s)")
     parser.add_argument("--output", type=Path, default=Path("fit_schemes.json"), help="default: %(default)s")
     options = parser.parse_args(arguments)
@@ -87,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     points = sample(truth, options.points, np.random.default_rng(options.seed)).points
     rows = []
     for name in options.schemes:
-        rows.append(row(name, options.data, truth, points))
+        rows.append(row(name, options.data, truth, points, options.levels))
         print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
         options.output.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
     print(table(rows))
