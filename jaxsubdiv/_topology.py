@@ -69,6 +69,8 @@ class LimitMasks(eqx.Module):
     points: Masks
     tangents: tuple[Masks, Masks] | None
     """Their cross product is the normal; None where only the position is known."""
+    patches: Int[Array, "f w"] | None = None
+    """Vertices whose spline is the limit over each face of the last level, -1 where there is none; see `_patches`."""
 
 
 class Topology(eqx.Module):
