@@ -33,8 +33,8 @@ class SurfaceJet(NamedTuple):
     """Unit normals, at right angles to both derivatives."""
     error: Float[Array, "p"]
     """About how far the limit may be from the points, in the unit of the mesh: what the levels to come displace, by the
-    bend of the refined face. 0 where the surface is evaluated as it is; beside creases, where one normal stands for two,
-    it may be too small."""
+    bend of the refined face. 0 where the surface is evaluated as it is; beside creases, where one normal stands for
+    two, it may be too small."""
 
 
 def evaluate_control(scheme: AbstractScheme, topology: Topology, control: Control, at: SurfacePoint) -> SurfaceJet:

@@ -1,7 +1,7 @@
 """How well each scheme fits one scan of a head, by the same call and without any tuning.
 
-Points drawn by area from the surface of a head (no noise, so that what is left is the scheme's), and a control mesh that
-lies about it. Lengths in mm. Prints a Markdown table, and writes JSON.
+Points drawn by area from the surface of a head (no noise, so that what is left is the scheme's), and a control mesh
+that lies about it. Lengths in mm. Prints a Markdown table, and writes JSON.
 
     pip install -e '.[bench]' && python tests/bench/fit_schemes.py --output schemes.json
 
