@@ -16,9 +16,7 @@ CASES = {
     "torus": (js.CatmullClark(), meshes.torus(5, 4), {}, 1),
     "cube": (js.CatmullClark(), meshes.cube(), {}, 2),
     "cube, creased": (js.CatmullClark(), meshes.cube(), {"creases": js.Creases([(0, 1)])}, 2),
-    "sheet": (js.CatmullClark(), meshes.grid(4, 3, bumpy=0.2), {}, 1),
     "triangles on a torus": (js.Loop(), meshes.torus(5, 4, "triangle"), {}, 1),
-    "icosahedron": (js.Loop(), meshes.icosahedron(), {}, 2),
     "double pyramid": (js.Loop("warren"), meshes.fan(5), {}, 2),
 }
 
