@@ -1,4 +1,4 @@
-"""The README's gallery: `python notebooks/gallery.py` runs every notebook, and saves the figure that it names `gallery`.
+"""The README's gallery: `python notebooks/gallery.py` runs every notebook and saves the figure that it names `gallery`.
 
 Arguments choose notebooks by their numbers: `python notebooks/gallery.py 02 04`.
 """
@@ -13,7 +13,7 @@ import matplotlib
 HERE = Path(__file__).parent
 FOLDER = HERE.parent / "docs" / "gallery"
 WIDTH = 480  # pixels
-COLOURS = 128  # a palette makes small files
+COLOURS = 256  # a palette makes small files
 
 
 def main(numbers: list[str]) -> None:
