@@ -13,7 +13,7 @@ import matplotlib
 HERE = Path(__file__).parent
 FOLDER = HERE.parent / "docs" / "gallery"
 WIDTH = 480  # pixels
-COLOURS = 256  # a palette makes small files
+LARGEST = 140_000  # bytes; beyond that a palette, which makes small files of few colours
 
 
 def main(numbers: list[str]) -> None:
@@ -39,7 +39,9 @@ def main(numbers: list[str]) -> None:
         names["gallery"].savefig(picture, dpi=150, facecolor="white")
         image = Image.open(picture).convert("RGB")
         image = image.resize((WIDTH, round(image.height * WIDTH / image.width)), Image.Resampling.LANCZOS)
-        image.quantize(COLOURS).save(picture, optimize=True)
+        image.save(picture, optimize=True)
+        if picture.stat().st_size > LARGEST:
+            image.quantize(256).save(picture, optimize=True)
         kilobytes = picture.stat().st_size / 1000
         print(f"{picture.relative_to(HERE.parent)}: {image.width} x {image.height}, {kilobytes:.0f} kB")
 
