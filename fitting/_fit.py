@@ -223,6 +223,11 @@ def _warn_if_far(off: float, control: js.Control) -> None:
 def _check(scheme: js.AbstractScheme, topology: js.Topology, control: js.Control, scan: Scan) -> None:
     if not topology.levels:
         raise ValueError("a fit needs a topology of one level or more; this one has none. Two or three serve well.")
+    if topology.has_seams:
+        raise ValueError(
+            "a mesh with seams cannot be fitted: its copies of one vertex would come apart. Fit without seams, or with "
+            "`js.Loop()` or `js.CatmullClark()`, whose `js.Creases` keep one vertex a place."
+        )
     eqx.filter_eval_shape(js.refine, scheme, topology, control)  # for its checks of the shapes
     # The solver keeps its own state in the default dtype, and cannot mix it with another.
     dtypes, default = (control.vertices.dtype, scan.points.dtype), jnp.result_type(float)

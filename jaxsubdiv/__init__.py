@@ -7,6 +7,8 @@ from ._control import Control as Control
 from ._creases import Creases as Creases
 from ._curvature import Curvatures as Curvatures
 from ._curvature import curvatures as curvatures
+from ._draw import draw_surface as draw_surface
+from ._draw import view_of as view_of
 from ._errors import MeshError as MeshError
 from ._evaluate import SurfaceJet as SurfaceJet
 from ._evaluate import evaluate_control as evaluate_control
@@ -26,6 +28,8 @@ from ._scheme.doo_sabin import DooSabin as DooSabin
 from ._scheme.interpolating import Interpolating as Interpolating
 from ._scheme.kobbelt import Kobbelt as Kobbelt
 from ._scheme.loop import Loop as Loop
+from ._seams import SplitMesh as SplitMesh
+from ._seams import split_normals as split_normals
 from ._stencils import interpolating_control as interpolating_control
 from ._stencils import stencils as stencils
 from ._surface import PointsAndNormals as PointsAndNormals

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
+from jaxtyping import Int
 from numpy.typing import ArrayLike
 
 from ._errors import MeshError, name_rows
@@ -45,6 +46,19 @@ def sharpened(stage: Stage, creases: Creases) -> Stage:
     """
     edges, vertices = np.asarray(creases.edges, np.int64).reshape(-1, 2), np.asarray(creases.vertices, np.int64).ravel()
     stride = stage.n_vertices
+    at = edge_rows(stage, edges)
+    outside = vertices[(vertices < 0) | (vertices >= stride)]
+    if len(outside):
+        raise MeshError(f"sharp vertices {name_rows(outside)} are not in the mesh, which has {stride} vertices.")
+    edge_sharpness, vertex_sharpness = np.zeros(len(stage.edges)), np.zeros(stride)
+    edge_sharpness[at] = _values("sharpness", creases.sharpness, len(edges))
+    vertex_sharpness[vertices] = _values("vertex_sharpness", creases.vertex_sharpness, len(vertices))
+    return stage._replace(edge_sharpness=edge_sharpness, vertex_sharpness=vertex_sharpness)
+
+
+def edge_rows(stage: Stage, edges: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
+    """Which edges of the mesh these are, given by their ends in either order; `MeshError` where there is none."""
+    stride = stage.n_vertices
     keys = np.sort(stage.edges, axis=1).astype(np.int64) @ (stride, 1)
     order = np.argsort(keys)
     wanted = np.sort(edges, axis=1) @ (stride, 1)
@@ -52,13 +66,7 @@ def sharpened(stage: Stage, creases: Creases) -> Stage:
     missing = (keys[at] != wanted) | ((edges < 0) | (edges >= stride)).any(axis=1)
     if missing.any():
         raise MeshError(f"creases {name_rows(f'({a}, {b})' for a, b in edges[missing])} are not edges of the mesh.")
-    outside = vertices[(vertices < 0) | (vertices >= stride)]
-    if len(outside):
-        raise MeshError(f"sharp vertices {name_rows(outside)} are not in the mesh, which has {stride} vertices.")
-    edge_sharpness, vertex_sharpness = np.zeros(len(keys)), np.zeros(stride)
-    edge_sharpness[at] = _values("sharpness", creases.sharpness, len(edges))
-    vertex_sharpness[vertices] = _values("vertex_sharpness", creases.vertex_sharpness, len(vertices))
-    return stage._replace(edge_sharpness=edge_sharpness, vertex_sharpness=vertex_sharpness)
+    return at
 
 
 def _values(name: str, values: Numbers, n: int) -> np.ndarray:

@@ -2,12 +2,14 @@
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._control import Control
 from ._linalg import cross, norm, take, unit
+from ._patches import patch_points
 from ._refine import refine
 from ._scheme.base import AbstractScheme
 from ._scheme.bezier_triangle import BezierTriangle, quad_patch, triangle_patch
@@ -31,7 +33,8 @@ class SurfaceJet(NamedTuple):
     """Unit normals, at right angles to both derivatives."""
     error: Float[Array, "p"]
     """About how far the limit may be from the points, in the unit of the mesh: what the levels to come displace, by the
-    bend of the refined face. 0 where the surface is evaluated as it is."""
+    bend of the refined face. 0 where the surface is evaluated as it is; beside creases, where one normal stands for
+    two, it may be too small."""
 
 
 def evaluate_control(scheme: AbstractScheme, topology: Topology, control: Control, at: SurfacePoint) -> SurfaceJet:
@@ -39,7 +42,8 @@ def evaluate_control(scheme: AbstractScheme, topology: Topology, control: Contro
 
     `BezierTriangle` is evaluated as it is. For the others a cubic patch is laid through the vertices and normals of the
     refined face there, so that more levels come closer. Linear schemes need `limit=True`: their patches then have
-    their corners and normals on the limit surface, and are exact there.
+    their corners and normals on the limit surface, and are exact there. Catmull-Clark and Loop are evaluated as they
+    are on refined faces away from extraordinary vertices, creases and boundaries: there the limit is a spline.
 
     Args:
         scheme: the rules.
@@ -70,6 +74,10 @@ def _evaluate(scheme: AbstractScheme, topology: Topology, control: Control, at: 
     else:
         surface = refine(scheme, topology, control)
         x, n, faces, levels = surface.vertices, surface.normals, surface.faces, len(topology.levels)
+    splines, before_limit = None if topology.limit is None else topology.limit.patches, x
+    if splines is not None:
+        bare = eqx.tree_at(lambda topology: topology.limit, topology, None)
+        before_limit = refine(scheme, bare, control).vertices
     n_triangles = topology.control_faces[3].shape[0]
     given, uv = at.face.astype(jnp.int32), at.uv.astype(x.dtype)
     in_triangle = given < n_triangles
@@ -86,7 +94,13 @@ def _evaluate(scheme: AbstractScheme, topology: Topology, control: Control, at: 
                 face = 4 * face + child
             corners = faces[size][jnp.clip(face, 0, faces[size].shape[0] - 1)]
             points, _ = patch(corners, u[:, None], v[:, None], x, n)
-            found.append((points, jnp.zeros_like(u) if exact else _bend(corners, x, n)))
+            bend = jnp.zeros_like(u) if exact else _bend(corners, x, n)
+            if splines is not None and splines.shape[1] == 4 * size:
+                table = splines[jnp.clip(face, 0, splines.shape[0] - 1)]
+                regular = table[:, 0] >= 0
+                points = jnp.where(regular[:, None], patch_points(table, u, v, before_limit), points)
+                bend = jnp.where(regular, 0.0, bend)
+            found.append((points, bend))
         if len(found) == 1:
             return found[0]
         (a, of_a), (b, of_b) = found

@@ -32,6 +32,8 @@ class Stage(NamedTuple):
     """Of every edge, 0 where it is smooth; None where no edge is a crease."""
     vertex_sharpness: Float[np.ndarray, "v"] | None = None
     """Likewise for the vertices."""
+    seams: Int[np.ndarray, "s 2"] | None = None
+    """Pairs of boundary edges, which run opposite ways, that are one edge of the surface; None where there are none."""
 
 
 def stage_of(n_vertices: int, faces: Faces, sides: HalfEdges | None = None, level: int = 0) -> Stage:
@@ -194,7 +196,13 @@ def hybrid_split(stage: Stage) -> Stage:
         level=stage.level + 1,
         edge_sharpness=_worn(stage.edge_sharpness, 2, 2 * n_edges + 3 * n_triangles + 4 * n_quads),
         vertex_sharpness=_worn(stage.vertex_sharpness, 1, n + n_edges + n_quads),
+        seams=_halved(stage.seams),
     )
+
+
+def _halved(seams: Int[np.ndarray, "s 2"] | None) -> Int[np.ndarray, "t 2"] | None:
+    """Seams of the next level: the first half of one edge lies on the second half of the other."""
+    return None if seams is None else np.concatenate([2 * seams + (0, 1), 2 * seams + (1, 0)]).astype(np.int32)
 
 
 def _worn(sharpness: Float[np.ndarray, "n"] | None, children: int, total: int) -> Float[np.ndarray, "m"] | None:

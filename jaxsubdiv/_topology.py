@@ -14,12 +14,13 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from ._admissible import warn_of_folds
-from ._creases import Creases, sharpened
+from ._creases import Creases, Numbers, sharpened
 from ._errors import MeshError
 from ._fans import Fans, as_table, group_corners, mesh_fans
 from ._half_edges import Faces, half_edges
 from ._masks import Masks
 from ._mesh import ControlMesh
+from ._seams import sewn
 from ._stage import Stage, numbers, stage_of
 
 MAX_LEVELS = 8
@@ -49,6 +50,8 @@ class Level(AbstractLevel):
     """Edge that follows each corner of a quad: the row of its edge vertex among the edge vertices."""
     old_fans: Fans | None
     """Corners around the old vertices in the refined mesh; only where their normals are computed anew."""
+    seams: Int[Array, "s 2"] | None = None
+    """Pairs of boundary edges that are one edge of the surface: their edge vertices lie at one place."""
 
 
 class MaskLevel(AbstractLevel):
@@ -66,6 +69,8 @@ class LimitMasks(eqx.Module):
     points: Masks
     tangents: tuple[Masks, Masks] | None
     """Their cross product is the normal; None where only the position is known."""
+    patches: Int[Array, "f w"] | None = None
+    """Vertices whose spline is the limit over each face of the last level, -1 where there is none; see `_patches`."""
 
 
 class Topology(eqx.Module):
@@ -94,6 +99,11 @@ class Topology(eqx.Module):
         """Number of control vertices."""
         return self.control_fans.order.shape[0]
 
+    @property
+    def has_seams(self) -> bool:
+        """Whether boundary edges are sewn together at some level."""
+        return any(isinstance(level, Level) and level.seams is not None for level in self.levels)
+
 
 @runtime_checkable  # the tests check annotations while they run
 class BuildsTables(Protocol):
@@ -102,6 +112,7 @@ class BuildsTables(Protocol):
     takes: ClassVar[tuple[int, ...]]
     uses_normals: ClassVar[bool]
     takes_creases: ClassVar[bool]
+    takes_seams: ClassVar[bool]
 
     @property
     def tables_for(self) -> str: ...
@@ -119,6 +130,7 @@ def build_topology(
     *,
     mesh_normals: bool = False,
     creases: Creases | None = None,
+    seams: Numbers | None = None,
     limit: bool = False,
 ) -> Topology:
     """Tables for refining `mesh` by `levels` levels.
@@ -130,14 +142,17 @@ def build_topology(
         mesh_normals: put out, at the last level, the normals (4)-(6) of the refined mesh at every vertex, instead of
             the scheme's own. They differ only at vertices older than the last level. Linear schemes know no others.
         creases: sharp edges and vertices, for `CatmullClark` and `Loop`.
+        seams: `[v]`, equal numbers for control vertices that are one place with several normals, for `Interpolating`
+            and `CirclePreserving`: `origin` from `split_normals`. Boundary edges with equal ends become one edge of
+            the surface, at right angles to the normals of both sides.
         limit: after the last level, move every vertex to its place on the limit surface, and put out the normals there:
             for linear schemes.
 
     Raises:
         ValueError: `levels` is no whole number from 0 to 8, the refined mesh would outgrow 32-bit indices, or the
-            scheme knows no creases or no limit masks.
+            scheme knows no creases, seams or limit masks.
         MeshError: the mesh was made with `check=False` and does not pass, the scheme does not take faces of this kind,
-            or a crease is not an edge of the mesh.
+            a crease is not an edge of the mesh, or seams do not fit the vertices.
 
     Warns:
         UserWarning: a normal that the mesh was given is not admissible, and the scheme keeps it; see
@@ -152,10 +167,14 @@ def build_topology(
     if creases is not None:
         if not scheme.takes_creases:
             raise ValueError(
-                f"{type(scheme).__name__} has no creases; CatmullClark and Loop do. In a scheme of points and normals "
-                "a zero normal leaves an edge straight at that end."
+                f"{type(scheme).__name__} has no creases; CatmullClark and Loop do. In Interpolating and "
+                "CirclePreserving several normals at a vertex make one: see `split_normals`."
             )
         stage = sharpened(stage, creases)
+    if seams is not None:
+        if not scheme.takes_seams:
+            raise ValueError(f"{type(scheme).__name__} has no seams; Interpolating and CirclePreserving do.")
+        stage = sewn(stage, mesh.vertices, seams)
     tables = []
     for i in range(levels):
         recompute = scheme.recomputes_normals or (mesh_normals and i == levels - 1)
@@ -226,6 +245,7 @@ def point_normal_level(stage: Stage, recompute: bool) -> Level:
         quads=stage.faces[4],
         quad_edges=stage.face_edges[4],
         old_fans=_old_fans(stage) if recompute else None,
+        seams=None if stage.seams is None else as_table(stage.seams),
     )
 
 

@@ -15,6 +15,7 @@ from .._masks import Matrix, as_masks, identity, stack
 from .._normals import Boundary, Weights, chord_normals, fan_normals, ring_sum
 from .._stage import Sides, Stage, hybrid_split, sides_of
 from .._topology import AbstractLevel, Level, LimitMasks, MaskLevel, point_normal_level
+from .seams import on_seams
 
 OldNormals: TypeAlias = Literal["keep", "recompute"]
 
@@ -77,6 +78,8 @@ class AbstractScheme(eqx.Module):
     """Whether the vertices of a level are the first of the next one, moved or not."""
     takes_creases: ClassVar[bool] = False
     """Whether `build_topology` may be given creases."""
+    takes_seams: ClassVar[bool] = False
+    """Whether `build_topology` may be given seams."""
     order: ClassVar[int]
     """Power of the edge length by which the first new vertices come closer to a smooth surface through the control
     vertices (with its own normals), on regular meshes."""
@@ -121,6 +124,7 @@ class AbstractPointNormalScheme(AbstractScheme):
     interpolates: ClassVar[bool] = True
     is_linear: ClassVar[bool] = False
     uses_normals: ClassVar[bool] = True
+    takes_seams: ClassVar[bool] = True
 
     @property
     def tables_for(self) -> str:
@@ -148,12 +152,18 @@ class AbstractPointNormalScheme(AbstractScheme):
     ) -> Rows:
         """Positions of the face vertices, one in the middle of every quad."""
 
+    def seam_factor(self, t_a: Rows, t_b: Rows) -> Float[Array, "*rows 1"] | float:
+        """Factor of the tangents at both ends of a seam, which run from the first end to the second."""
+        return 1.0
+
     def refine_level(
         self, h: Float[Array, ""] | None, level: Level, x: Float[Array, "v 3"], n: Float[Array, "v 3"], recompute: bool
     ) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
         assert h is not None
         values = jnp.concatenate([x, n], axis=1)
         edge_points = _edge_points(self, h, level, values)
+        if level.seams is not None:
+            edge_points = on_seams(level, x, n, edge_points, h, self.seam_factor)
         face_points = _face_points(self, h, level, x, n, values, edge_points)
         refined = jnp.concatenate([x, edge_points, face_points])
         edge_normals = _unit_normals(_edge_normal_sums(self, level, values, refined), n, level.edges)

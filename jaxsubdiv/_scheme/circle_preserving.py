@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linalg import Rows, Vectors, apart, dot, take_each, together
+from .._linalg import Rows, Vectors, apart, dot, take_each, together, unit
 from .._normals import Boundary, Weights, chord_normals
 from .._topology import Level
 from .base import AbstractPointNormalScheme, Edges, tangent_length
@@ -54,6 +54,9 @@ class CirclePreserving(AbstractPointNormalScheme):
 
     def edge_points(self, h: Float[Array, ""], edges: Edges) -> Vectors:
         return arc_rule(h, *edges)
+
+    def seam_factor(self, t_a: Rows, t_b: Rows) -> Float[Array, "*rows 1"]:
+        return arc_factor(unit(t_a), unit(t_b))  # on a circle tangents turn by the angle by which normals do
 
     def face_points(
         self,

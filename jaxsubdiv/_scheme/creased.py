@@ -7,8 +7,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .._fans import as_table
 from .._masks import Matrix, Term, as_masks, entries, identity, scaled
 from .._normals import Weights
+from .._patches import patch_vertices
 from .._stage import INFINITE, Sides, Stage, after_one_level, ring_positions, sides_of
 from .._topology import LimitMasks
 from .base import AbstractPrimalScheme, check_option
@@ -134,7 +136,11 @@ class AbstractCreasedScheme(AbstractPrimalScheme):
         inside, at_border = (rule == 0) & (n_ends == 0), n_ends == 1
         known = 1.0 * (inside | (at_border & (np.bincount(stage.edges[now.edge > 0].ravel(), minlength=n) == 2)))
         first, second = self.limit_tangents(stage, sides, ring_positions(sides))
-        return LimitMasks(as_masks(points), (as_masks(scaled(known, first)), as_masks(scaled(known, second))))
+        return LimitMasks(
+            as_masks(points),
+            (as_masks(scaled(known, first)), as_masks(scaled(known, second))),
+            as_table(patch_vertices(stage, sides, self.takes[-1], now.edge > 0)),
+        )
 
 
 class Border(NamedTuple):
