@@ -131,7 +131,7 @@ def draw_surface(
     image = np.zeros((seen.height * seen.width, 4))
     image[seen.pixel, :3], image[seen.pixel, 3] = np.clip(colours, 0, 1), 1
     image = image.reshape(seen.height, seen.width, 4)
-    image = sum(image[i::_FINER, j::_FINER] for i in range(_FINER) for j in range(_FINER)) / _FINER**2
+    image = np.stack([image[i::_FINER, j::_FINER] for i in range(_FINER) for j in range(_FINER)]).mean(axis=0)
     image[..., :3] /= np.where(image[..., 3:] > 0, image[..., 3:], 1)
     ax.imshow(image, extent=frame, origin="lower", interpolation="antialiased")
     ax.axis("off")
