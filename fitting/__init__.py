@@ -37,3 +37,4 @@ from ._saved import load as load
 from ._scan import Scan as Scan
 from ._scan import ScanError as ScanError
 from ._scan import read_scan as read_scan
+from ._search import search_closest as search_closest
