@@ -1,7 +1,7 @@
 """`fit_cohort`: one control mesh fitted to many scans in one compiled call, with optimistix; no step on the host.
 
-It minimises the same rows as `fit`, with the same robust weights, annealed alike. Two things are simpler, for the sake of
-one program for all: the strength of the bend prior is given, or found once by an ordinary fit; and a sweep's normal
+It minimises the same rows as `fit`, with the same robust weights, annealed alike. Two things are simpler, for the sake
+of one program for all: the strength of the bend prior is given, or found once by an ordinary fit; and a sweep's normal
 equations are solved by conjugate gradients, without a matrix, not further than a sweep deserves.
 """
 
@@ -239,9 +239,10 @@ def fit_cohort(
     surfaces = jax.vmap(lambda h, control: _refined(common, h, control), (0, 0))(states.h, states.control)
     converged = np.asarray(states.converged)
     if not converged.all():
+        which = np.flatnonzero(~converged)
         warnings.warn(
-            f"{int(np.sum(~converged))} of {n} fits did not converge, of the scans {name_rows(np.flatnonzero(~converged))}: "
-            "see `Cohort.converged`. Align them better, or give more `max_sweeps`.",
+            f"{len(which)} of {n} fits did not converge, of the scans {name_rows(which)}: see `Cohort.converged`. "
+            "Align them better, or give more `max_sweeps`.",
             stacklevel=2,
         )
     return Cohort(

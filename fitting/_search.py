@@ -84,15 +84,16 @@ def _patches(vertices: Float[Array, "v 3"], triangles: Int[Array, "s 3"], patch:
     filled = jnp.pad(triangles, ((0, n * patch - len(triangles)), (0, 0)), mode="edge")
     corners = vertices[filled].reshape(n, patch, 3, 3)
     a, b, c = (corners[:, :, i] for i in range(3))
+    # Where the normals cancel there is no axis, and the cylinder is a sphere.
     axis = unit(jnp.sum(cross(b - a, c - a), axis=1))
     x = corners.reshape(n, -1, 3)
     middle = (x.min(axis=1) + x.max(axis=1)) / 2
-    along = dot(axis[:, None], x - middle[:, None])[..., 0]
+    axes = jnp.broadcast_to(axis[:, None], x.shape)
+    along = dot(axes, x - middle[:, None])[..., 0]
     low, high = along.min(axis=1, keepdims=True), along.max(axis=1, keepdims=True)
     middle = middle + axis * (low + high) / 2
     away = x - middle[:, None]
-    beside = norm(away - dot(axis[:, None], away) * axis[:, None])[..., 0]
-    # Where the normals cancel there is no axis, and the cylinder is a sphere.
+    beside = norm(away - dot(axes, away) * axes)[..., 0]
     edges = jnp.concatenate([a, b - a, c - a], axis=-1)
     return _Patches(edges.swapaxes(1, 2), middle, axis, (high - low) / 2, beside.max(axis=1, keepdims=True))
 
@@ -131,7 +132,7 @@ def _keys(patches: _Patches, point: Float[Array, "3"], number: int) -> tuple[Int
     Args:
         number: mask of the bits that are the patch's number; without them the bound is a little less, and still one.
     """
-    away = point - patches.middle
+    away = point[None] - patches.middle
     rounding = _ROUNDING * jnp.finfo(point.dtype).eps
     along, squared = dot(patches.axis, away), dot(away, away)
     beside = jnp.sqrt(jnp.maximum(squared * (1 - rounding) - along**2, 0.0))
