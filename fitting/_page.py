@@ -14,7 +14,6 @@ import jaxsubdiv as js
 from jaxsubdiv._files import replacing
 
 from ._coverage import distances_to_scan
-from ._picture import view_of
 from ._report import Report
 from ._result import FitResult
 
@@ -81,7 +80,7 @@ def _data(
     return {
         "centre": centre.tolist(),
         "radius": max(radius, 1e-9),
-        "view": view_of(surface).ravel().tolist(),
+        "view": js.view_of(surface).ravel().tolist(),
         "surface": {"vertices": _floats(vertices), "triangles": _whole(np.asarray(surface.triangles()))},
         "distance": {"values": _floats(distances), "limit": _limit(np.abs(result.distances))},
         "deviation": None if deviation is None else {"values": _floats(deviation), "limit": _limit(deviation)},

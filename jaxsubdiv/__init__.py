@@ -7,6 +7,8 @@ from ._control import Control as Control
 from ._creases import Creases as Creases
 from ._curvature import Curvatures as Curvatures
 from ._curvature import curvatures as curvatures
+from ._draw import draw_surface as draw_surface
+from ._draw import view_of as view_of
 from ._errors import MeshError as MeshError
 from ._evaluate import SurfaceJet as SurfaceJet
 from ._evaluate import evaluate_control as evaluate_control

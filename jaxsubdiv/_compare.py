@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ._distance import closest_on_mesh
+from ._draw import draw_surface, view_of
 from ._files import replacing
 from ._io import read_mesh
 from ._mesh import ControlMesh
@@ -125,31 +126,20 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def draw(path: Path, rows: Sequence[Row], truth: ControlMesh) -> None:
-    """All surfaces side by side, the true one first, seen from where the mesh is broadest."""
+    """All surfaces side by side, the true one first, seen from where it is broadest."""
     from matplotlib.figure import Figure
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-    middle, spread = truth.vertices.mean(axis=0), truth.vertices - truth.vertices.mean(axis=0)
-    _, _, axes = np.linalg.svd(spread[:: max(1, len(spread) // 2000)], full_matrices=False)
-    view = axes if np.linalg.det(axes) > 0 else -axes
-    light = np.array([0.3, 0.4, 0.866])
-    shown = [("the true surface", truth.vertices, truth.triangulated().faces[3])]
-    shown += [(row.name, np.asarray(row.surface.vertices), np.asarray(row.surface.triangles())) for row in rows]
+    view = view_of(truth)
+    (left, bottom, _), (right, top, _) = np.quantile(truth.vertices @ view.T, (0, 1), axis=0)
+    shown = [("the true surface", truth), *((row.name, row.surface) for row in rows)]
     columns = min(4, len(shown))
-    figure = Figure(figsize=(3 * columns, 3.2 * -(-len(shown) // columns)), layout="constrained")
-    for i, (title, vertices, triangles) in enumerate(shown):
-        corners = ((vertices - middle) @ view.T)[triangles]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        shade = np.clip(np.abs(normals @ light) / np.where(length > 0, length, 1)[:, 0], 0, 1)
-        axis = figure.add_subplot(-(-len(shown) // columns), columns, i + 1, projection="3d")
-        colours = np.outer(0.25 + 0.75 * shade, (0.85, 0.8, 0.72))
-        axis.add_collection3d(Poly3DCollection(corners, facecolors=colours, edgecolors="none"))
-        low, high = ((truth.vertices - middle) @ view.T).min(axis=0), ((truth.vertices - middle) @ view.T).max(axis=0)
-        axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]), title=title)
-        axis.set_box_aspect(np.maximum(high - low, 1e-9))
-        axis.view_init(elev=90, azim=-90)
-        axis.set_axis_off()
+    figure = Figure(figsize=(3 * columns, 3.4 * -(-len(shown) // columns)), layout="constrained")
+    axes = figure.subplots(-(-len(shown) // columns), columns, squeeze=False).ravel()
+    for ax, (title, surface) in zip(axes, shown, strict=False):
+        draw_surface(ax, surface, view=view, frame=(left, right, bottom, top))
+        ax.set_title(title)
+    for ax in axes[len(shown) :]:
+        ax.axis("off")
     with replacing(path) as unfinished:
         figure.savefig(unfinished, dpi=120, format=path.suffix.lstrip(".") or "png")
 
