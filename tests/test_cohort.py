@@ -25,8 +25,11 @@ def start() -> js.Control:
 def truths() -> list[js.RefinedSurface]:
     """Surfaces of three sizes."""
     problem = scans.problem()
-    stretches = [np.array(row) for row in ((1, 1, 1), (1.05, 0.97, 1), (0.96, 1, 1.06))]
-    controls = [js.Control(problem.truth.vertices * row, problem.truth.normals / row) for row in stretches]
+    stretches = [np.array(row) for row in ((1.0, 1.0, 1.0), (1.05, 0.97, 1.0), (0.96, 1.0, 1.06))]
+    controls = [
+        js.Control(np.asarray(problem.truth.vertices) * row, np.asarray(problem.truth.normals) / row)
+        for row in stretches
+    ]
     return [js.refine(js.Interpolating(problem.h), problem.topology, control) for control in controls]
 
 

@@ -58,9 +58,14 @@ def test_places_are_those_of_the_host(shape, dtype):
     assert found.face.dtype == np.int32 and found.uv.dtype == dtype
     own, host = (distances(surface, at, points) for at in (found, expected))
     size = np.linalg.norm(points, axis=1) + np.ptp(surface.vertices, axis=0).max()
-    assert np.all(np.abs(own - host) <= TOLERANCE[dtype] * size)
-    # Beyond an edge or a vertex several faces are equally near, as at the vertices, with which the points begin.
-    assert np.mean(np.asarray(found.face)[150:300] == np.asarray(expected.face)[150:300]) > 0.5
+    # Beyond an edge or a vertex several faces are equally near, as at the vertices, with which the points begin. Of two
+    # bent quads, equally near as triangles, one is nearer: by a quarter of their twist at most.
+    same = np.asarray(found.face) == np.asarray(expected.face)
+    assert np.mean(same[150:300]) > 0.5
+    corners = np.asarray(surface.vertices)[np.asarray(surface.faces[4])]
+    twist = np.linalg.norm(np.einsum("qkx,k->qx", corners, (1, -1, 1, -1)), axis=1)
+    allowed = TOLERANCE[dtype] * size + np.where(same, 0, twist.max(initial=0) / 4)
+    assert np.all(np.abs(own - host) <= allowed)
 
 
 def test_patches_and_blocks_of_any_size_find_the_same():
