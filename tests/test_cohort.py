@@ -111,7 +111,10 @@ def test_one_subject_does_not_affect_another():
 def test_several_at_once_are_fitted_as_one_by_one():
     found = fitted(at_once=2)
     np.testing.assert_array_equal(found.sweeps, cohort().sweeps)
-    np.testing.assert_allclose(found.surfaces.vertices, cohort().surfaces.vertices, atol=1e-6)
+    # Rounding decides when a sweep is solved well enough: equal as far as the tolerance goes.
+    np.testing.assert_allclose(found.robust_rms, cohort().robust_rms, rtol=1e-3)
+    for i in range(N_SUBJECTS):
+        assert off(surface(cohort(), i), surface(found, i)) < 0.05 * scans.SIGMA
 
 
 def test_what_did_not_converge_is_told():
