@@ -13,7 +13,6 @@ from typing import Any, NamedTuple, final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 import optimistix as optx
 from jax import lax
@@ -22,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 import jaxsubdiv as js
 from jaxsubdiv._errors import name_rows
 
+from ._conjugate_gradients import ConjugateGradients
 from ._correspondence import boundary_vertices
 from ._elements import flat, to_unknowns
 from ._fit import AT_REST, LEAST_NOISE, check, fit, given_normals, surface_moved
@@ -296,8 +296,8 @@ def _stacked(controls: list[js.Control], scans: Sequence[Scan], at_once: int) ->
             jnp.pad(scan.relative_deviations(), (0, size - scan.n_points), constant_values=1),
         )
         whole = eqx.tree_at(lambda s: tuple(vars(s).values()), scan, filled_up, is_leaf=lambda leaf: leaf is None)
-        neighbours = jnp.asarray(around.neighbours, jnp.int32)
-        full = Surroundings(*(filled(jnp.asarray(part)) for part in around[:2]), filled(neighbours))
+        neighbours = filled(jnp.asarray(around.neighbours, jnp.int32))
+        full = Surroundings(filled(jnp.asarray(around.crowded)), filled(jnp.asarray(around.trusted)), neighbours)
         return _Subject(control, whole, full, jnp.asarray(scan.n_points / size, scan.points.dtype))
 
     one_each = [subject(*pair) for pair in zip(controls, scans, strict=True)]
@@ -449,55 +449,3 @@ def _held(common: _Common, state: _State, step: Float[Array, "n"]) -> Float[Arra
     return jnp.clip(
         state.hold * jnp.append(factor, jnp.ones(step.shape[0] - n, factor.dtype)), loosest, FASTEST * loosest
     )
-
-
-class ConjugateGradients(lx.AbstractLinearSolver):
-    """Least squares by conjugate gradients on the normal equations, which are never formed.
-
-    lineax has this as `Normal(CG)`, which multiplies in three places: here it is one, which is compiled in a third of
-    the time; and it stops where the gradient has fallen enough, or steps run out, which is no failure.
-
-    Source: Hestenes and Stiefel 1952, as CGLS in Björck, Numerical methods for least squares problems, 1996, sec. 7.4.
-    """
-
-    rtol: float
-    """Of the norm of the gradient."""
-    max_steps: int = eqx.field(static=True)
-
-    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> lx.AbstractLinearOperator:
-        return lx.linearise(operator)
-
-    def compute(
-        self, state: lx.AbstractLinearOperator, vector: Float[Array, "m"], options: dict[str, Any]
-    ) -> tuple[Float[Array, "n"], lx.RESULTS, dict[str, Any]]:
-        x, zero = jnp.zeros(state.in_size(), vector.dtype), jnp.zeros((), vector.dtype)
-
-        def goes_on(carry: tuple) -> Bool[Array, ""]:
-            k, _, _, _, gamma, first = carry
-            return (k == 0) | ((k < self.max_steps) & (gamma > self.rtol**2 * first))
-
-        def step(carry: tuple) -> tuple:
-            k, x, left, direction, gamma, first = carry
-            along = state.mv(direction)  # 0 in the first step, which only finds the gradient
-            alpha = _over(gamma, jnp.sum(along**2))
-            x, left = x + alpha * direction, left - alpha * along
-            gradient = state.T.mv(left)
-            new = jnp.sum(gradient**2)
-            direction = gradient + _over(new, gamma) * direction
-            return k + 1, x, left, direction, new, jnp.where(k == 0, new, first)
-
-        k, x, *_ = lax.while_loop(goes_on, step, (jnp.int32(0), x, vector, x, zero, zero))
-        return x, lx.RESULTS.successful, {"num_steps": k}
-
-    def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        return state.T, options
-
-    def conj(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        return lx.conj(state), options
-
-    def assume_full_rank(self) -> bool:
-        return True
-
-
-def _over(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
-    return jnp.where(b > 0, a / jnp.where(b > 0, b, 1.0), 0.0)
