@@ -1,5 +1,6 @@
 """The picture of a fit: control mesh, surface with its error, convergence. matplotlib, so that no display is needed."""
 
+import io
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,7 +37,16 @@ def draw_fit(result: FitResult, start: js.ControlMesh, *, title: str = "") -> "F
         from matplotlib.figure import Figure
     except ImportError as error:
         raise ImportError("pictures need matplotlib: pip install 'jaxsubdiv[viz]'") from error
-    figure = Figure(figsize=(15, 9.5), layout="constrained", dpi=100)
+
+    class Picture(Figure):
+        """A figure that notebooks show where pyplot, which would tell them how, was never imported."""
+
+        def _repr_png_(self) -> bytes:
+            file = io.BytesIO()
+            self.savefig(file, format="png")
+            return file.getvalue()
+
+    figure = Picture(figsize=(15, 9.5), layout="constrained", dpi=100)
     figure.suptitle(title, fontsize=14)
     (before, after, smooth), (error, counts, convergence) = figure.subplots(2, 3)
     view, surface = js.view_of(result.surface), result.surface

@@ -65,7 +65,7 @@ def draw_surface(
     A refined surface is shaded by its normals, a control mesh face by face. The inside of a surface is bluish.
 
     Args:
-        ax: matplotlib axes. More may be drawn over the surface, at `points @ view_of(surface, view).T`.
+        ax: matplotlib axes. More may be drawn over the surface, at the first two of `points @ view.T`.
         surface: what to draw.
         view: rows right, up and towards the viewer, `[3, 3]`; or the direction to the viewer, `[3]`. Default:
             `view_of(surface)`.

@@ -42,7 +42,7 @@ def test_views_are_rotations_towards_an_open_surface_and_the_broad_side_of_a_clo
 
 def test_a_surface_covers_its_outline_and_the_axes_have_its_unit():
     ax = Figure().subplots()
-    js.draw_surface(ax, square(size=5.0), view=FROM_ABOVE, frame=(-5, 5, 0, 5))
+    js.draw_surface(ax, square(size=5.0), view=FROM_ABOVE, frame=(-5, 5, 0, 5), pixels=480)
     [image] = ax.images
     shown = np.asarray(image.get_array())
     assert shown.shape == (240, 480, 4) and image.get_extent() == [-5, 5, 0, 5]

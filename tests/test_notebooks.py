@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import pytest
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
@@ -20,9 +21,11 @@ def test_there_are_notebooks():
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_runs_from_top_to_bottom(path, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
+    plt.switch_backend("Agg")
     names: dict = {"__name__": "__main__"}
     for number, cell in enumerate(_code_cells(path), start=1):
         exec(compile("".join(cell["source"]), f"{path.name}, code cell {number}", "exec"), names)
+        plt.close("all")  # as a notebook does after every cell
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
