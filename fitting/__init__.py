@@ -2,6 +2,8 @@
 
 from ._align import Alignment as Alignment
 from ._align import align as align
+from ._cohort import Cohort as Cohort
+from ._cohort import fit_cohort as fit_cohort
 from ._control_mesh import control_mesh as control_mesh
 from ._correspondence import closest_points as closest_points
 from ._example import example as example
@@ -16,6 +18,8 @@ from ._landmarks import match_landmarks as match_landmarks
 from ._landmarks import read_landmarks as read_landmarks
 from ._mesh_topology import MeshTopology as MeshTopology
 from ._mesh_topology import topology_of as topology_of
+from ._modes import Modes as Modes
+from ._modes import shape_modes as shape_modes
 from ._page import write_page as write_page
 from ._picture import draw_fit as draw_fit
 from ._posterior import Uncertainty as Uncertainty
@@ -37,3 +41,4 @@ from ._saved import load as load
 from ._scan import Scan as Scan
 from ._scan import ScanError as ScanError
 from ._scan import read_scan as read_scan
+from ._search import search_closest as search_closest

@@ -1,6 +1,6 @@
 """Correspondence: for every scan point the closest point of the surface. On the host, outside of differentiation."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,6 +14,8 @@ _MORE_CANDIDATES = 4  # times as many, for the points whose closest face is not 
 _PAIRS_AT_ONCE = 2_000_000  # bounds the memory to a few hundred MB, however large scan and surface are
 _LARGE, _MOST_PARTS = 1.5, 24  # times the usual size: a larger triangle stands in the tree in parts, to so many a side
 _QUAD_STEPS = 3
+
+AnyArray: TypeAlias = Any  # of numpy or of JAX: what is below `triangle_distance` serves `_search` too
 
 
 class _Triangles(NamedTuple):
@@ -48,11 +50,11 @@ def closest_points(surface: RefinedSurface, points: Float[np.ndarray, "p 3"]) ->
     points = np.asarray(points, np.float64)
     a, b, c = (vertices[column].T for column in np.asarray(surface.triangles()).T)
     triangle, uv = _nearest_triangle(_Triangles(a, b - a, c - a), points)
-    face, uv = _to_faces(len(surface.faces[3]), triangle, uv)
+    face, uv = to_faces(len(surface.faces[3]), triangle, uv)
     in_quad = np.flatnonzero(face >= len(surface.faces[3]))
     if len(in_quad):
         quad = np.asarray(surface.faces[4])[face[in_quad] - len(surface.faces[3])]
-        uv[in_quad] = _polish(vertices[quad], points[in_quad], uv[in_quad])
+        uv[in_quad] = polish(vertices[quad], points[in_quad], uv[in_quad])
     return SurfacePoint(face.astype(np.int32), uv.astype(surface.vertices.dtype))
 
 
@@ -89,7 +91,9 @@ def _nearest_triangle(
             near = to_centre - centres.radius[candidates] <= np.sqrt(squared[rows])[:, None]
             point, column = np.nonzero(near)
             triangle = centres.triangle[candidates[point, column]]
-            found, places = _distance_squared(triangles, triangle, points[rows[point]])
+            corner, ab, ac = (values[:, triangle] for values in triangles)
+            found, *places = triangle_distance(corner, ab, ac, points[rows[point]].T)
+            places = np.stack(places, axis=-1)
             order = np.lexsort((found, point))
             first = order[np.searchsorted(point[order], np.unique(point))]
             row = rows[point[first]]
@@ -120,15 +124,20 @@ def _centres(triangles: _Triangles) -> _Centres:
     return _Centres(np.concatenate(points), np.concatenate(owner), np.concatenate(sizes))
 
 
-def _distance_squared(
-    triangles: _Triangles, which: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 2"]]:
-    """Squared distance to a triangle each, and the place of the closest point: a + u (b - a) + v (c - a)."""
-    # Coordinate by coordinate: rows of three are slow in numpy.
-    a, ab, ac = (rows[:, which] for rows in triangles)
-    ap = points.T - a
+def triangle_distance(
+    a: AnyArray, ab: AnyArray, ac: AnyArray, points: AnyArray, xp: Any = np
+) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """Squared distance to a triangle each, and u and v of the closest point, a + u (b - a) + v (c - a).
 
-    def dot(x: Float[np.ndarray, "3 n"], y: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "n"]:
+    Args:
+        a, ab, ac: a corner, and the edges from it to the next corner and to the one before; `[3, ...]`, coordinate by
+            coordinate, as rows of three are slow.
+        points: a point each, likewise.
+        xp: numpy or jax.numpy.
+    """
+    ap = points - a
+
+    def dot(x: AnyArray, y: AnyArray) -> AnyArray:
         return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
 
     d00, d01, d11, d20, d21 = dot(ab, ab), dot(ab, ac), dot(ac, ac), dot(ap, ab), dot(ap, ac)
@@ -137,39 +146,35 @@ def _distance_squared(
         u, v = (d11 * d20 - d01 * d21) / area, (d00 * d21 - d01 * d20) / area
         inside = (u >= 0) & (v >= 0) & (u + v <= 1)  # False where the area is zero
         # Outside, the closest point lies on one of the edges ab, ac, bc; a triangle without area is its edges alone.
-        on_ab = np.nan_to_num(np.clip(d20 / d00, 0, 1))
-        on_ac = np.nan_to_num(np.clip(d21 / d11, 0, 1))
-        on_bc = np.nan_to_num(np.clip((d21 - d20 - d01 + d00) / (d00 - 2 * d01 + d11), 0, 1))
+        on_ab = xp.nan_to_num(xp.clip(d20 / d00, 0, 1))
+        on_ac = xp.nan_to_num(xp.clip(d21 / d11, 0, 1))
+        on_bc = xp.nan_to_num(xp.clip((d21 - d20 - d01 + d00) / (d00 - 2 * d01 + d11), 0, 1))
 
-    def squared(u: Float[np.ndarray, "n"], v: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        away = u * ab + v * ac - ap  # not by the products above: their difference has no digits close by
+    def squared(u: AnyArray, v: AnyArray) -> AnyArray:
+        away = u[None] * ab + v[None] * ac - ap  # not by the products above: their difference has no digits close by
         return dot(away, away)
 
-    u, v = np.where(inside, u, on_ab), np.where(inside, v, 0.0)
+    u, v = xp.where(inside, u, on_ab), xp.where(inside, v, 0.0)
     best = squared(u, v)
-    for other_u, other_v in ((np.zeros_like(on_ac), on_ac), (1 - on_bc, on_bc)):
-        other = np.where(inside, np.inf, squared(other_u, other_v))
+    for other_u, other_v in ((xp.zeros_like(on_ac), on_ac), (1 - on_bc, on_bc)):
+        other = xp.where(inside, np.inf, squared(other_u, other_v))
         closer = other < best
-        u, v, best = np.where(closer, other_u, u), np.where(closer, other_v, v), np.where(closer, other, best)
-    return best, np.stack([u, v], axis=-1)
+        u, v, best = xp.where(closer, other_u, u), xp.where(closer, other_v, v), xp.where(closer, other, best)
+    return best, u, v
 
 
-def _to_faces(
-    n_triangle_faces: int, triangle: Int[np.ndarray, "p"], uv: Float[np.ndarray, "p 2"]
-) -> tuple[Int[np.ndarray, "p"], Float[np.ndarray, "p 2"]]:
-    """From the triangulated view, where a quad is (a, b, c) and (a, c, d), to faces and their own coordinates."""
+def to_faces(n_triangle_faces: int, triangle: AnyArray, uv: AnyArray, xp: Any = np) -> tuple[AnyArray, AnyArray]:
+    """From the triangulated view, where a quad is (a, b, c) and (a, c, d), to faces `[p]` and their own `uv [p, 2]`."""
     half = triangle - n_triangle_faces
     in_quad, second = half >= 0, half % 2 == 1
     u, v = uv.T
-    quad_uv = np.stack([np.where(second, u, u + v), np.where(second, u + v, v)], axis=1)
-    return np.where(in_quad, n_triangle_faces + half // 2, triangle), np.where(in_quad[:, None], quad_uv, uv)
+    quad_uv = xp.stack([xp.where(second, u, u + v), xp.where(second, u + v, v)], axis=1)
+    return xp.where(in_quad, n_triangle_faces + half // 2, triangle), xp.where(in_quad[:, None], quad_uv, uv)
 
 
-def _polish(
-    corners: Float[np.ndarray, "p 4 3"], points: Float[np.ndarray, "p 3"], uv: Float[np.ndarray, "p 2"]
-) -> Float[np.ndarray, "p 2"]:
-    """Gauss-Newton steps to the closest point of a bilinear patch, kept inside of it."""
-    a, b, c, d = np.moveaxis(corners, 1, 0)
+def polish(corners: AnyArray, points: AnyArray, uv: AnyArray, xp: Any = np) -> AnyArray:
+    """Gauss-Newton steps to the closest point of a bilinear patch `[p, 4, 3]` each, kept inside of it."""
+    a, b, c, d = xp.moveaxis(corners, 1, 0)
     twist = a - b + c - d
     for _ in range(_QUAD_STEPS):
         u, v = uv[:, :1], uv[:, 1:]
@@ -180,16 +185,14 @@ def _polish(
         # Where a side holds the point fast, the other coordinate moves alone.
         held_u = ((uv[:, 0] <= 0) & (g0 > 0)) | ((uv[:, 0] >= 1) & (g0 < 0))
         held_v = ((uv[:, 1] <= 0) & (g1 > 0)) | ((uv[:, 1] >= 1) & (g1 < 0))
-        h01 = np.where(held_u | held_v, 0, h01)
+        h01 = xp.where(held_u | held_v, 0.0, h01)
         det = h00 * h11 - h01 * h01
-        safe = np.where(det > 0, det, 1)
-        step = np.stack([(h11 * g0 - h01 * g1), (h00 * g1 - h01 * g0)], axis=1) / safe[:, None]
-        step[det <= 0] = 0
-        step[held_u, 0] = 0
-        step[held_v, 1] = 0
-        uv = np.clip(uv - step, 0, 1)
+        safe = xp.where(det > 0, det, 1.0)
+        step_u = xp.where(held_u | (det <= 0), 0.0, (h11 * g0 - h01 * g1) / safe)
+        step_v = xp.where(held_v | (det <= 0), 0.0, (h00 * g1 - h01 * g0) / safe)
+        uv = xp.clip(uv - xp.stack([step_u, step_v], axis=1), 0, 1)
     return uv
 
 
-def _dot(a: Float[np.ndarray, "*p 3"], b: Float[np.ndarray, "*p 3"]) -> Float[np.ndarray, "*p"]:
-    return np.einsum("...x,...x->...", a, b)
+def _dot(a: AnyArray, b: AnyArray) -> AnyArray:
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]

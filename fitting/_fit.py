@@ -31,9 +31,9 @@ _FAR = 0.05
 # Scans in metres against a mesh in mm differ by 1000; a partial scan of the anatomy by much less than this.
 _UNIT_RATIO = 20.0
 # The least noise, in control edges: a perfect scan would have none, and its points infinite weight.
-_LEAST_NOISE = 1e-4
+LEAST_NOISE = 1e-4
 # Movements far below a control edge are at rest, however exact the scan.
-_AT_REST = 0.01
+AT_REST = 0.01
 _LEAST_MARGIN = 0.05  # of a control normal at the start; see `js.admissible_margin`
 _MOST = 0.9  # of the surface: so much of it has to be at rest
 
@@ -95,10 +95,10 @@ def fit(
         ValueError: the topology has no levels, or does not fit the control.
         RuntimeError: with `throw`, the fit did not converge or met values that are not finite.
     """
-    _check(scheme, topology, control, scan)
+    check(scheme, topology, control, scan)
     # Made here and not in the signature: arrays made while a module loads would settle JAX's device and precision.
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
-    control = js.Control(control.vertices, _given_normals(topology, control))
+    control = js.Control(control.vertices, given_normals(topology, control))
     recipe = Recipe(
         scheme,
         len(topology.levels),
@@ -114,7 +114,7 @@ def fit(
     surface = js.refine(scheme, topology, control)
     open_vertices, edge = boundary_vertices(surface), float(edge_length(topology, control.vertices))
     around = surroundings(scan)
-    seen = look(surface, scan, open_vertices, around, edge, loss, _LEAST_NOISE * edge)
+    seen = look(surface, scan, open_vertices, around, edge, loss, LEAST_NOISE * edge)
     widest = float(seen.scale)  # a robust scale of the start's own error: outliers must not widen it
     _warn_if_far(float(np.median(np.abs(seen.distances))), control)
     rms, robust_rms, result = [float(seen.rms)], [float(seen.robust_rms)], optx.RESULTS.nonlinear_max_steps_reached
@@ -126,16 +126,16 @@ def fit(
         if not np.isfinite(refined.vertices).all():
             result = optx.RESULTS.nonfinite  # what the last sound sweep found is what comes back
             break
-        moved = float(_moved(surface, refined))
+        moved = float(surface_moved(surface, refined))
         (scheme, control), surface = proposed, refined
-        floor = max(widest * 0.5 ** (sweep + 1), _LEAST_NOISE * edge)
+        floor = max(widest * 0.5 ** (sweep + 1), LEAST_NOISE * edge)
         seen = look(surface, scan, open_vertices, around, edge, loss, floor)
         rms.append(float(seen.rms))
         robust_rms.append(float(seen.robust_rms))
         if on_sweep is not None:
             on_sweep(Sweep(sweep + 1, robust_rms[-1], moved))
         annealed = problem.annealed and floor <= seen.scale
-        at_rest = tolerance * max(_uncertainty(seen, control), _AT_REST * edge)
+        at_rest = tolerance * max(_uncertainty(seen, control), AT_REST * edge)
         if annealed and max(moved, abs(robust_rms[-1] - robust_rms[-2])) <= at_rest:
             result = optx.RESULTS.successful
             break
@@ -168,7 +168,7 @@ _apply = eqx.filter_jit(apply_offset)
 
 
 @eqx.filter_jit
-def _moved(before: js.RefinedSurface, after: js.RefinedSurface) -> Float[Array, ""]:
+def surface_moved(before: js.RefinedSurface, after: js.RefinedSurface) -> Float[Array, ""]:
     """How far a surface moved across itself: nine tenths of its vertices by less than this.
 
     The rest may be where the control mesh is too coarse for the scan, and points change sides for ever.
@@ -200,7 +200,7 @@ def _anchors(
     return Anchors(points, at.face, corners, weights, deviations)
 
 
-def _given_normals(topology: js.Topology, control: js.Control) -> Float[Array, "v 3"]:
+def given_normals(topology: js.Topology, control: js.Control) -> Float[Array, "v 3"]:
     """Unit normals; from the faces where a control vertex has none, or has one that would fold the surface."""
     normals = np.asarray(unit(control.normals))
     mesh = js.ControlMesh(control.vertices, topology.control_faces, check=False)
@@ -220,7 +220,7 @@ def _warn_if_far(off: float, control: js.Control) -> None:
         )
 
 
-def _check(scheme: js.AbstractScheme, topology: js.Topology, control: js.Control, scan: Scan) -> None:
+def check(scheme: js.AbstractScheme, topology: js.Topology, control: js.Control, scan: Scan) -> None:
     if not topology.levels:
         raise ValueError("a fit needs a topology of one level or more; this one has none. Two or three serve well.")
     if topology.has_seams:

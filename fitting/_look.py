@@ -91,11 +91,11 @@ def look(
     """
     at = closest_points(surface, np.asarray(scan.points))
     edge_and_floor = (jnp.asarray(value, scan.points.dtype) for value in (edge, floor))
-    return _measure(surface, scan, at, open_vertices, around, *edge_and_floor, loss)
+    return measure(surface, scan, at, open_vertices, around, *edge_and_floor, loss)
 
 
 @jax.jit
-def _measure(
+def measure(
     surface: js.RefinedSurface,
     scan: Scan,
     at: js.SurfacePoint,

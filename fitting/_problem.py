@@ -1,6 +1,6 @@
 """One sweep's equations: what scan and priors say of the unknowns, and the step that makes both most probable."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from scipy.sparse.linalg import SuperLU, splu
 import jaxsubdiv as js
 from jaxsubdiv._linalg import unit
 
+from ._correspondence import AnyArray
 from ._elements import (
     Elements,
     differentiate,
@@ -42,10 +43,10 @@ from ._residuals import (
 # Standard deviation of a step in control edges: what neither scan nor priors hold stays near where it is. A control
 # vertex that turns back is held faster, and one that goes on is let go again: where the surface cannot follow the scan
 # (an ear in a coarse mesh) points change sides from sweep to sweep, and exact steps would go to and fro for ever.
-_STEP, _HOLD, _LET_GO, _FASTEST = 0.25, 8.0, 0.7, 1e6
-_SOFTER = 0.3  # factor of the bend prior from sweep to sweep, down to its own strength
+STEP, HOLD, LET_GO, FASTEST = 0.25, 8.0, 0.7, 1e6
+SOFTER = 0.3  # factor of the bend prior from sweep to sweep, down to its own strength
 _SETTLED = 0.3  # mean change of the logarithm of the bend prior's strength in a sweep
-_LEAST_LEFT = 0.1  # of the degrees of freedom: what is less says that the scan has too few points
+LEAST_LEFT = 0.1  # of the degrees of freedom: what is less says that the scan has too few points
 _PROBES = 16  # random vectors of a trace
 _MOST_RINGS = 3
 _TINY = np.finfo(float).tiny
@@ -101,7 +102,7 @@ class Problem:
         self._edge = float(edge_length(topology, control.vertices))
         self._elements: Elements | None = None
         self._precision: Float[np.ndarray, "f"] = np.zeros(0)  # of the bends, a control face; found in the first sweep
-        self._hold = np.full(self.is_free.shape, (_STEP * self._edge) ** -2)
+        self._hold = np.full(self.is_free.shape, (STEP * self._edge) ** -2)
         self.loose = self._hold.copy()
         self._last_step = np.zeros(self.is_free.shape)
         self.annealed = False
@@ -122,7 +123,7 @@ class Problem:
         if self._priors.bend is None:
             self._find_bend(found, step, loose)
         else:
-            self._set_bend(self._precision * _SOFTER)
+            self._set_bend(self._precision * SOFTER)
         return to_unknowns(jnp.asarray(step), self._zero)
 
     def precision_matrix(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> sp.csc_array:
@@ -167,12 +168,12 @@ class Problem:
 
     def distance_precisions(self, seen: Look) -> Float[np.ndarray, "p"]:
         """1 / variance of every distance. A fit of many unknowns to few points leaves less than the noise in them."""
-        left = max(1 - self.determined / max(float(np.sum(seen.weights)), 1.0), _LEAST_LEFT)
+        left = max(1 - self.determined / max(float(np.sum(seen.weights)), 1.0), LEAST_LEFT)
         return left * np.asarray(seen.precisions, np.float64)
 
     def start(self, scheme: js.AbstractScheme, control: js.Control) -> Start:
         """The arguments of the residuals, for a sweep that starts here."""
-        template = _moved_to(self._template, np.asarray(control.vertices, np.float64))
+        template = moved_to(self._template, np.asarray(control.vertices, np.float64))
         template = jnp.asarray(template, control.vertices.dtype)
         return Start(scheme, self._topology, control, template, self._anchors, self._edges, self._bend_edges)
 
@@ -229,8 +230,8 @@ class Problem:
         n = width * len(self._template)
         agree = np.sum((step * self._last_step)[:n].reshape(-1, width), axis=1) if width else np.zeros(0)
         factor = np.ones(len(step))
-        factor[:n] = np.repeat(np.where(agree < 0, _HOLD, _LET_GO), width)
-        self._hold = np.clip(self._hold * factor, self.loose, _FASTEST * self.loose)
+        factor[:n] = np.repeat(np.where(agree < 0, HOLD, LET_GO), width)
+        self._hold = np.clip(self._hold * factor, self.loose, FASTEST * self.loose)
         self._last_step = step
 
     def _set_bend(self, precision: Float[np.ndarray, "f"]) -> None:
@@ -296,11 +297,16 @@ def factorise(matrix: sp.csc_array) -> SuperLU:
     return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
-def _moved_to(template: Float[np.ndarray, "v 3"], vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
-    """The template, turned, scaled and shifted to where the vertices are. Source: Umeyama 1991."""
+def moved_to(template: AnyArray, vertices: AnyArray, xp: Any = np, *, scale: bool = True) -> AnyArray:
+    """The template `[v, 3]`, turned, scaled and shifted to where the vertices are. Source: Umeyama 1991.
+
+    Args:
+        xp: numpy or jax.numpy.
+        scale: False only turns and shifts.
+    """
     middle, there = template.mean(axis=0), vertices.mean(axis=0)
-    a, b = template - middle, vertices - there
-    u, s, vt = np.linalg.svd(b.T @ a)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    scale = (s * signs).sum() / max((a**2).sum(), np.finfo(float).tiny)
-    return scale * a @ (u * signs @ vt).T + there
+    a, b = template - middle[None], vertices - there[None]
+    u, s, vt = xp.linalg.svd(b.T @ a)
+    signs = xp.stack([xp.ones_like(s[0]), xp.ones_like(s[0]), xp.sign(xp.linalg.det(u @ vt))])
+    factor = (s * signs).sum() / xp.maximum((a**2).sum(), np.finfo(a.dtype).tiny) if scale else 1.0
+    return factor * a @ (u * signs[None] @ vt).T + there[None]

@@ -189,13 +189,11 @@ def _anchor_rows(anchors: Anchors, surface: js.RefinedSurface) -> Float[Array, "
 
 
 def _margin_rows(topology: js.Topology, control: js.Control) -> Float[Array, "c"]:
-    rows = []
-    for size, faces in sorted(topology.control_faces.items()):
-        for corner in range(size):
-            at, after, before = (faces[:, (corner + step) % size] for step in (0, 1, -1))
-            centre = take(control.vertices, at)
-            face_normal = unit(cross(take(control.vertices, after) - centre, take(control.vertices, before) - centre))
-            rows.append(dot(unit(take(control.normals, at)), face_normal)[:, 0])
+    rows, normals = [], unit(control.normals)
+    for _, faces in sorted(topology.control_faces.items()):
+        corners = take(control.vertices, faces)  # at once: every gather is a loop to compile in the derivative
+        after, before = (jnp.roll(corners, step, axis=1) - corners for step in (-1, 1))
+        rows.append(dot(take(normals, faces), unit(cross(after, before)))[..., 0].T.reshape(-1))
     margin = jnp.concatenate(rows)
     return jax.nn.softplus((_MARGIN - margin) / _MARGIN_SOFTNESS) * (_MARGIN_SOFTNESS / _MARGIN_SPREAD)
 

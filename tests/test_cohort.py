@@ -1,0 +1,203 @@
+"""Many scans at once: each fit as a fit of its own, whatever the others are; and the modes of the shapes found."""
+
+import functools
+import warnings
+
+import jax.numpy as jnp
+import meshes
+import numpy as np
+import pytest
+import scans
+
+import fitting
+import jaxsubdiv as js
+
+N_SUBJECTS, SIZES = 3, (600, 500, 550)
+PRIORS = fitting.Priors(bend=0.5)
+
+
+@functools.cache
+def start() -> js.Control:
+    return js.Control(scans.problem().start.vertices, scans.problem().truth.normals)
+
+
+@functools.cache
+def truths() -> list[js.RefinedSurface]:
+    """Surfaces of three sizes."""
+    problem = scans.problem()
+    stretches = [np.array(row) for row in ((1.0, 1.0, 1.0), (1.05, 0.97, 1.0), (0.96, 1.0, 1.06))]
+    controls = [
+        js.Control(np.asarray(problem.truth.vertices) * row, np.asarray(problem.truth.normals) / row)
+        for row in stretches
+    ]
+    return [js.refine(js.Interpolating(problem.h), problem.topology, control) for control in controls]
+
+
+@functools.cache
+def subjects() -> tuple[fitting.Scan, ...]:
+    """Noisy, of different lengths, the second with outliers."""
+    found, rng = [], np.random.default_rng(3)
+    for i, (surface, n) in enumerate(zip(truths(), SIZES, strict=True)):
+        points = np.array(js.sample(surface, n, jnp.array([0, i], jnp.uint32)).points)
+        points += rng.normal(scale=scans.SIGMA, size=points.shape)
+        if i == 1:
+            points[::20] += rng.normal(scale=8.0, size=points[::20].shape)
+        found.append(fitting.Scan(points))
+    return tuple(found)
+
+
+def fitted(chosen=None, **options) -> fitting.Cohort:
+    """All options that change the compiled program stay the same from test to test."""
+    problem = scans.problem()
+    chosen = subjects() if chosen is None else chosen
+    given = {"priors": PRIORS, "max_sweeps": 40} | options
+    return fitting.fit_cohort(js.Interpolating(), problem.topology, start(), chosen, **given)
+
+
+@functools.cache
+def cohort() -> fitting.Cohort:
+    return fitted()
+
+
+def off(surface: js.RefinedSurface, other: js.RefinedSurface) -> float:
+    """Root mean square distance from vertices to a surface."""
+    points = np.asarray(surface.vertices)
+    away = np.asarray(js.evaluate(other, fitting.closest_points(other, points)).points) - points
+    return float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
+
+
+def surface(found: fitting.Cohort, i: int) -> js.RefinedSurface:
+    return js.RefinedSurface(found.surfaces.vertices[i], found.surfaces.normals[i], found.surfaces.faces)
+
+
+def test_every_fit_is_as_one_of_its_own():
+    found = cohort()
+    assert found.converged.all() and len(found) == N_SUBJECTS
+    for i, scan in enumerate(subjects()[:2]):
+        single = fitting.fit(js.Interpolating(), scans.problem().topology, start(), scan, priors=PRIORS, throw=False)
+        of_single, of_cohort = off(truths()[i], single.surface), off(truths()[i], surface(found, i))
+        assert of_cohort < 1.1 * of_single + 0.01
+        assert off(single.surface, surface(found, i)) < 0.3 * of_single
+        assert found.noise[i] == pytest.approx(single.noise, rel=0.1)
+        assert found.rms[i][found.sweeps[i]] == pytest.approx(single.rms[-1], rel=0.02)
+
+
+def test_outliers_lose_their_weight_and_padding_has_none():
+    weights = cohort().weights
+    assert np.median(weights[1][: SIZES[1] : 20]) < 0.2 < 0.8 < np.median(weights[1][: SIZES[1]])
+    for i, n in enumerate(SIZES):
+        assert np.all(weights[i][n:] == 0) and np.sum(weights[i][:n] > 0) > 0.9 * n
+
+
+def test_histories_end_where_the_fits_did():
+    found = cohort()
+    for i, n in enumerate(found.sweeps):
+        for rows in (found.rms[i], found.robust_rms[i]):
+            assert np.isfinite(rows[: n + 1]).all() and np.isnan(rows[n + 1 :]).all()
+        assert found.robust_rms[i][n] < found.robust_rms[i][0] / 2
+
+
+def test_one_subject_does_not_affect_another():
+    wild = np.array(subjects()[1].points)
+    wild[: len(wild) // 2] = np.random.default_rng(0).uniform(-200, 200, (len(wild) // 2, 3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # whether the wild one converges is not what is asked
+        found = fitted((subjects()[0], fitting.Scan(wild), subjects()[2]))
+    for i in (0, 2):
+        np.testing.assert_allclose(found.control.vertices[i], cohort().control.vertices[i], atol=1e-9)
+        assert found.sweeps[i] == cohort().sweeps[i]
+
+
+def test_several_at_once_are_fitted_as_one_by_one():
+    found = fitted(at_once=2)
+    np.testing.assert_array_equal(found.sweeps, cohort().sweeps)
+    # Rounding decides when a sweep is solved well enough: equal as far as the tolerance goes.
+    np.testing.assert_allclose(found.robust_rms, cohort().robust_rms, rtol=1e-3)
+    for i in range(N_SUBJECTS):
+        assert off(surface(cohort(), i), surface(found, i)) < 0.05 * scans.SIGMA
+
+
+def test_what_did_not_converge_is_told():
+    with pytest.warns(UserWarning, match="3 of 3 fits did not converge, of the scans 0, 1, 2"):
+        found = fitted(tolerance=0.0)
+    assert not found.converged.any() and np.all(found.sweeps == 40)
+    assert not found.result(0).report().converged
+
+
+def test_result_is_that_of_a_fit(tmp_path):
+    result = cohort().result(1)
+    report = result.report()
+    assert report.converged and report.sweeps == cohort().sweeps[1]
+    np.testing.assert_allclose(result.distances, result.distances)
+    np.testing.assert_allclose(result.weights, cohort().weights[1][: SIZES[1]], atol=1e-6)
+    assert result.rms[-1] == pytest.approx(np.sqrt(np.mean(result.distances**2)))
+    assert np.median(result.uncertainty().surface) < scans.SIGMA
+    result.save(tmp_path)
+    np.testing.assert_array_equal(fitting.load(tmp_path).control.vertices, result.control.vertices)
+
+
+def test_smoothness_is_that_of_the_pilot():
+    problem = scans.problem()
+    pilot = fitting.fit(js.Interpolating(), problem.topology, start(), subjects()[0], throw=False)
+    found = fitted(priors=None, pilot=pilot)
+    assert found.converged.all()
+    assert off(pilot.surface, surface(found, 0)) < 0.3 * off(truths()[0], pilot.surface)
+
+
+def test_bad_scans_are_named(as_users_run):
+    few = fitting.Scan(np.eye(3))
+    with pytest.raises(fitting.ScanError, match=r"^scan 1: the scan has 3 points for 12"):
+        fitted((subjects()[0], few))
+    with_normals = fitting.Scan(subjects()[0].points, subjects()[0].points)
+    with pytest.raises(fitting.ScanError, match="scan 1 has no normals and others have"):
+        fitted((with_normals, subjects()[1]))
+    with pytest.raises(ValueError, match="there are 0 scans"):
+        fitted(())
+    with pytest.raises(ValueError, match="2 scans and 1 controls"):
+        fitting.fit_cohort(js.Interpolating(), scans.problem().topology, [start()], subjects()[:2])
+
+
+# ------------------------------------------------------------------------------------------------------------- modes
+
+
+def planted(n: int = 40) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Shapes of two modes, turned and shifted; the modes, and their scores."""
+    rng = np.random.default_rng(0)
+    mean = meshes.torus(12, 8)[0] * 10
+    mean -= mean.mean(axis=0)
+    z = mean[:, 2:]
+    raw = np.stack([mean * (1, -1, 0), np.sin(mean[:, :1] / 4) * (0, 0, 1) + 0 * z]).reshape(2, -1)
+    modes = np.linalg.qr(raw.T)[0].T.reshape(2, *mean.shape)
+    scores = rng.normal(size=(n, 2))
+    shapes = mean + np.einsum("sk,kvx->svx", scores * (12.0, 4.0), modes)
+    turns = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    turns *= np.sign(np.linalg.det(turns))[:, None, None]
+    return np.einsum("svx,sxy->svy", shapes, turns) + 100 * rng.normal(size=(n, 1, 3)), modes, scores
+
+
+@pytest.mark.parametrize("size", [False, True])
+def test_planted_modes_are_found(size):
+    shapes, _, scores = planted()
+    found = fitting.shape_modes(shapes, size=size)
+    np.testing.assert_allclose(found.share.sum(), 1)
+    assert found.share[:2].sum() > 0.98
+    np.testing.assert_allclose(found.deviations[:2], (12, 4), rtol=0.25)
+    for k in range(2):
+        assert abs(np.corrcoef(found.scores[:, k], scores[:, k])[0, 1]) > 0.95
+
+
+def test_shapes_come_back_from_their_scores():
+    shapes, _, _ = planted(6)
+    found = fitting.shape_modes(shapes)
+    for row, one in zip(found.scores, found.aligned, strict=True):
+        np.testing.assert_allclose(found.shape(row), one, atol=1e-9)
+    np.testing.assert_allclose(found.shape([]), found.mean)
+    np.testing.assert_allclose(found.scores.std(axis=0, ddof=1), 1)
+    edges = [np.linalg.norm(rows[:, 0] - rows[:, 1], axis=-1) for rows in (shapes, found.aligned)]
+    np.testing.assert_allclose(*edges)  # turned and shifted alone
+
+
+@pytest.mark.parametrize("vertices", [np.zeros((1, 5, 3)), np.zeros((5, 3)), np.full((3, 4, 3), np.nan)])
+def test_modes_need_shapes(vertices):
+    with pytest.raises(ValueError, match="two shapes or more"):
+        fitting.shape_modes(vertices)
