@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.control and not options.scans:
         parser.error("a control mesh needs a scan to be fitted to: give SCAN to --control")
-    _keep_compiled_programs()
+    _keep_what_serves_again()
     with plain_warnings():
         try:
             scans = _scan_files([Path(scan) for scan in options.scans])
@@ -259,8 +259,9 @@ def _size(points: np.ndarray) -> str:
     return " x ".join(f"{extent:.0f}" for extent in np.ptp(points, axis=0)) + " mm"
 
 
-def _keep_compiled_programs() -> None:
-    """Keep compiled programs from run to run, unless the environment says where already."""
+def _keep_what_serves_again() -> None:
+    """Keep freed memory, and compiled programs from run to run, unless the environment says where already."""
+    js.keep_freed_memory()
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxsubdiv"
         jax.config.update("jax_compilation_cache_dir", str(cache))

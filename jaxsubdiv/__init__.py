@@ -16,6 +16,7 @@ from ._io import PointCloud as PointCloud
 from ._io import read_mesh as read_mesh
 from ._io import read_points as read_points
 from ._io import write_mesh as write_mesh
+from ._memory import keep_freed_memory as keep_freed_memory
 from ._mesh import ControlMesh as ControlMesh
 from ._normals import estimate_normals as estimate_normals
 from ._refine import refine as refine

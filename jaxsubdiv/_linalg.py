@@ -5,6 +5,7 @@ and are what is computed with inside a stage: nothing is then broadcast or summe
 backend does slowly, and in a gradient twice so. Every function here takes either layout and gives back the same.
 """
 
+import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -13,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 PerRow: TypeAlias = Float[Array, "*rows 1"]
 
@@ -79,7 +80,13 @@ def kept_apart(stage: Callable) -> Callable:
     times slower forward, 2 times backward. A call that must not be inlined is kept in reverse and forward mode and
     under `vmap`. What a gradient needs of the stage is computed again, and not kept.
     """
-    called = jax.jit(jax.checkpoint(stage, prevent_cse=False))
+
+    @functools.wraps(stage)
+    def inside(*arguments: Any) -> Any:
+        with set_xla_metadata(inlineable=None):  # of the stage as a whole, not of the small calls that it makes
+            return stage(*arguments)
+
+    called = jax.jit(jax.checkpoint(inside, prevent_cse=False))
 
     def run(*arguments: Any) -> Any:
         if jax.default_backend() != "cpu":
@@ -108,11 +115,16 @@ def largest(a: Rows) -> PerRow:
     return jnp.maximum(jnp.maximum(jnp.abs(a.x), jnp.abs(a.y)), jnp.abs(a.z))
 
 
-def where(there: Array, a: Rows, b: Rows | float) -> Any:
-    """`a` in the rows that are there, else `b`."""
-    if isinstance(b, Vectors):
-        return jax.tree.map(lambda p, q: jnp.where(there, p, q), a, b)
-    return jax.tree.map(lambda p: jnp.where(there, p, b), a)
+def where(there: Bool[Array, "*rows 1"], a: Rows | PerRow | float, b: Rows | PerRow | float) -> Any:
+    """`a` in the rows that are there, else `b`; either may be a number a row, or one for all.
+
+    Inside a stage it stands for `jnp.where`, which is a compiled call itself: in a derivative that would be kept apart.
+    """
+    if isinstance(a, Vectors) or isinstance(b, Vectors):
+        p, q = (jax.tree.leaves(v) if isinstance(v, Vectors) else (v, v, v) for v in (a, b))
+        return Vectors(*(where(there, *coordinate) for coordinate in zip(p, q, strict=True)))
+    shape, dtype = jnp.broadcast_shapes(there.shape, jnp.shape(a), jnp.shape(b)), jnp.result_type(a, b)
+    return lax.select(*(jnp.broadcast_to(v, shape) for v in (there, jnp.asarray(a, dtype), jnp.asarray(b, dtype))))
 
 
 def unit_or(v: Rows, fallback: Rows | float, vanishes_below: PerRow | float = 0.0) -> Any:
@@ -133,7 +145,7 @@ def unit_or(v: Rows, fallback: Rows | float, vanishes_below: PerRow | float = 0.
     scale = largest(v)
     there = scale > jnp.maximum(vanishes_below, jnp.finfo(scale.dtype).tiny)
     # Guarded inside and outside of the root: one guard alone leaves NaN in the gradient of the other branch.
-    scaled = where(there, v, 1.0) / jnp.where(there, scale, 1.0)
+    scaled = where(there, v, 1.0) / where(there, scale, 1.0)
     return where(there, scaled / jnp.sqrt(dot(scaled, scaled)), fallback)
 
 

@@ -129,18 +129,19 @@ def _angle(c: Corners, a: Corners, b: Corners) -> Corners:
     direction = _direction(c, a, b)
     sine, cosine = dot(c, direction), dot(a, b)
     there = sine > 0  # atan2 has no gradient at the origin, where one edge or the angle is zero
-    return jnp.where(there, jnp.arctan2(jnp.where(there, sine, 1.0), cosine), 0.0) * direction
+    return where(there, jnp.arctan2(where(there, sine, 1.0), cosine), 0.0) * direction
 
 
 def _sphere(c: Corners, a: Corners, b: Corners) -> Corners:
     # Against the longest edge at this vertex, so that no unit enters; a short edge leaves a finite weight. An edge that
     # is rounding alone drops its corners: the weight there has a gradient of 1 / e, which says nothing.
     a2, b2 = dot(a, a), dot(b, b)
-    longest = lax.stop_gradient(jnp.maximum(a2, b2).max(axis=0, keepdims=True, initial=0.0))
+    longest = lax.stop_gradient(jnp.maximum(a2, b2).max(axis=0, initial=0.0))
+    longest = jnp.broadcast_to(longest[None], a2.shape)
     e = jnp.finfo(a2.dtype).eps
     there = lax.stop_gradient(jnp.minimum(a2, b2)) > (_ROUNDING_ERRORS * e) ** 2 * longest
-    scale = jnp.where(there, longest, 1.0)
-    c, a2, b2 = where(there, c, 1.0) / scale, *(jnp.where(there, square, 1.0) / scale for square in (a2, b2))
+    scale = where(there, longest, 1.0)
+    c, a2, b2 = where(there, c, 1.0) / scale, *(where(there, square, 1.0) / scale for square in (a2, b2))
     return where(there, c / ((a2 + e) * (b2 + e)), 0.0)
 
 

@@ -506,3 +506,19 @@ def test_gradients_have_the_scatters_that_a_search_would_find():
     topology, scheme = DEFAULT.topology, js.Interpolating()
     slope = jax.jit(jax.grad(lambda control: js.refine(scheme, topology, control).vertices.sum()))
     assert "scatter" in slope.lower(CONTROL).as_text()
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="only the CPU backend is told to keep stages apart")
+def test_stages_stay_programs_of_their_own_forward_and_backward():
+    # Were they inlined by another XLA, or did they call on smaller ones, everything would be slower in silence.
+    topology, scheme = DEFAULT.topology, js.Interpolating()
+
+    def normals(control):
+        return jnp.sum(js.refine(scheme, topology, control).normals)
+
+    def calls(function):
+        return jax.jit(function).lower(CONTROL).compile().as_text().count(" call(")
+
+    # Points of edges and faces, their sums of corner normals, and those made unit.
+    assert calls(normals) == 6 * LEVELS
+    assert calls(jax.grad(normals)) in range(2 * 6 * LEVELS - 2, 3 * 6 * LEVELS)

@@ -212,7 +212,7 @@ def _edge_normal_sums(
     if scheme.boundary == "chord":
         chord = chord_normals(edges.n_a, edges.n_b, edges.d)
         takes_chord = is_boundary(level, n_old) & (largest(chord) > 0)
-        total, rounding = where(takes_chord, chord, total), jnp.where(takes_chord, 0.0, rounding)
+        total, rounding = where(takes_chord, chord, total), where(takes_chord, 0.0, rounding)
     return jnp.concatenate([*jax.tree.leaves(total), rounding], axis=-1)[0]
 
 

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linalg import Rows, Vectors, apart, dot, take_each, together, unit
+from .._linalg import Rows, Vectors, apart, dot, take_each, together, unit, where
 from .._normals import Boundary, Weights, chord_normals
 from .._topology import Level
 from .base import AbstractPointNormalScheme, Edges, tangent_length
@@ -20,9 +20,9 @@ def arc_factor(n_a: Rows, n_b: Rows) -> Float[Array, "*rows 1"]:
     stays what it is there, with gradient 0; where a normal is missing it is 1.
     """
     cosine = dot(n_a, n_b)
-    c = jnp.sqrt((1 + jnp.where(cosine > -0.5, cosine, -0.5)) / 2)
+    c = jnp.sqrt((1 + where(cosine > -0.5, cosine, -0.5)) / 2)
     given = (dot(n_a, n_a) > 0) & (dot(n_b, n_b) > 0)
-    return jnp.where(given, 2 / (c * (1 + c)), 1.0)
+    return where(given, 2 / (c * (1 + c)), 1.0)
 
 
 def arc_rule(h: Float[Array, ""], x_a: Rows, x_b: Rows, n_a: Rows, n_b: Rows) -> Rows:

@@ -1,67 +1,220 @@
-"""How fast a refinement is, beside trimesh's Loop subdivision of the same mesh in the same run.
+"""How fast refinement is: beside C++, libigl and trimesh on the same work in the same run, and against its own parts.
 
-pip install -e '.[bench]' && pytest tests/bench/bench_refine.py --benchmark-group-by=group
+    pip install -e '.[bench]' && pytest tests/bench/bench_refine.py
+
+prints a table of ratios after the timings. float32, 4 levels. C++ (`gathers.cpp`, built with g++ on the spot) runs the
+same formulas on the same tables, on all cores: what a person would write for this alone. Lengths have no unit here.
 """
 
 import functools
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from gathers import Gathers
 
+import fitting
 import jaxsubdiv as js
 
 LEVELS = 4
-SCHEMES = {"interpolating": js.Interpolating(), "circle": js.CirclePreserving()}
+SCHEME = js.Interpolating()
+ROUNDS = {"min_rounds": 15, "warmup": True, "warmup_iterations": 2, "disable_gc": True}
+MESHES = ("triangles", "quads", "mixed", "shuffled")
+
+pytestmark = pytest.mark.benchmark(**ROUNDS)
+js.keep_freed_memory()
 
 
 @functools.cache
-def sphere() -> js.ControlMesh:
-    """5,120 triangles, 1.3 million after four levels."""
+def control_mesh(kind: str) -> js.ControlMesh:
+    """5,120 triangles, 6,144 quads, half of each, or the triangles in a random order, on a sphere."""
     ball = trimesh.creation.icosphere(4)
-    return js.ControlMesh(ball.vertices, ball.faces)
+    if kind == "triangles":
+        return js.ControlMesh(ball.vertices, ball.faces)
+    if kind == "shuffled":
+        rng = np.random.default_rng(0)
+        order, faces = rng.permutation(len(ball.vertices)), rng.permutation(ball.faces)
+        return js.ControlMesh(ball.vertices[order], np.argsort(order)[faces])
+    u, v = (grid.ravel() for grid in np.meshgrid(np.arange(96), np.arange(64), indexing="ij"))
+    vertices = torus(2 * np.pi * u / 96, 2 * np.pi * v / 64)
+    corners = [(u, v), (u + 1, v), (u + 1, v + 1), (u, v + 1)]
+    quads = np.stack([(a % 96) * 64 + b % 64 for a, b in corners], axis=1)
+    if kind == "quads":
+        return js.ControlMesh(vertices, quads)
+    half = len(quads) // 2
+    cut = quads[half:][:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
+    return js.ControlMesh(vertices, [*quads[:half].tolist(), *cut.tolist()])
 
 
-def single(control: js.Control) -> js.Control:
-    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), control)
+def torus(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    around = 2 + np.cos(v)
+    return np.stack([around * np.cos(u), around * np.sin(u), np.sin(v)], axis=1)
 
 
-@pytest.mark.benchmark(group="tables")
-def test_build_topology(benchmark):
-    benchmark(js.build_topology, sphere(), js.Interpolating(), LEVELS)
+@functools.cache
+def prepared(kind: str) -> tuple[js.Topology, js.Control]:
+    mesh = control_mesh(kind)
+    control = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), mesh.control())
+    return js.build_topology(mesh, SCHEME, LEVELS), control
 
 
-@pytest.mark.parametrize("name", SCHEMES)
-@pytest.mark.parametrize("put_out", ["vertices", "vertices and normals", "value and gradient"])
-def test_refine(benchmark, name, put_out):
-    benchmark.group = put_out
-    scheme, mesh = SCHEMES[name], sphere()
-    topology, control = js.build_topology(mesh, scheme, LEVELS), single(mesh.control())
-
-    def vertices(scheme, topology, control):
-        return js.refine(scheme, topology, control).vertices
-
-    def both(scheme, topology, control):
-        surface = js.refine(scheme, topology, control)
-        return surface.vertices, surface.normals
-
-    def value_and_grad(scheme, topology, control):
-        def value(of):
-            x = vertices(of[0], topology, of[1])
-            return jnp.vdot(x, x)
-
-        return jax.value_and_grad(value)((scheme, control))
-
-    run = {"vertices": vertices, "vertices and normals": both, "value and gradient": value_and_grad}[put_out]
-    compiled = jax.jit(run)
-    benchmark(lambda: jax.block_until_ready(compiled(scheme, topology, control)))
+def vertices(topology, control):
+    return js.refine(SCHEME, topology, control).vertices
 
 
-@pytest.mark.benchmark(group="vertices")
-def test_trimesh_loop_with_its_tables(benchmark):
-    mesh = sphere()
-    benchmark.pedantic(
-        trimesh.remesh.subdivide_loop, (mesh.vertices, np.asarray(mesh.faces[3]), LEVELS), rounds=2, iterations=1
-    )
+def vertices_and_normals(topology, control):
+    surface = js.refine(SCHEME, topology, control)
+    return surface.vertices, surface.normals
+
+
+def value_and_gradient(topology, control):
+    def value(control, h):
+        x = js.refine(js.Interpolating(h), topology, control).vertices
+        return jnp.vdot(x, x)
+
+    return jax.value_and_grad(value, argnums=(0, 1))(control, jnp.float32(1.0))
+
+
+def directional_derivative(topology, control):
+    return jax.jvp(functools.partial(vertices, topology), (control,), (control,))
+
+
+WORK = {
+    "vertices": vertices,
+    "normals": vertices_and_normals,
+    "gradient": value_and_gradient,
+    "jvp": directional_derivative,
+}
+
+
+def run(benchmark, function: Callable, *arguments) -> None:
+    benchmark(lambda: jax.block_until_ready(function(*arguments)))
+
+
+@pytest.mark.parametrize("kind", MESHES)
+@pytest.mark.parametrize("work", WORK)
+def test_refine(benchmark, work, kind):
+    benchmark.group, benchmark.name = kind, f"jaxsubdiv, {work}"
+    run(benchmark, jax.jit(WORK[work]), *prepared(kind))
+
+
+@pytest.mark.parametrize("kind", ["triangles", "quads"])
+@pytest.mark.parametrize("work", ["vertices", "normals"])
+def test_cpp(benchmark, work, kind):
+    benchmark.group, benchmark.name = kind, f"C++, {work}"
+    gathers = Gathers(*prepared(kind))
+    gathers.run(True)
+    surface = js.refine(SCHEME, *prepared(kind))
+    np.testing.assert_allclose(gathers.vertices, surface.vertices, atol=1e-5)
+    np.testing.assert_allclose(gathers.normals, surface.normals, atol=1e-3)
+    benchmark(gathers.run, work == "normals")
+
+
+@pytest.mark.parametrize("kind", ["triangles", "quads"])
+def test_floor(benchmark, kind):
+    """Every byte once: the control mesh and the tables read, the surface written, at the speed of a copy in place."""
+    benchmark.group, benchmark.name = kind, "floor"
+    topology, control = prepared(kind)
+    read = sum(leaf.nbytes for leaf in jax.tree.leaves((topology.levels, control)))
+    out = jax.eval_shape(vertices, topology, control)
+    source = np.zeros((read + out.size * 4) // 2, np.uint8)
+    target = np.zeros_like(source)
+    benchmark(np.copyto, target, source)
+
+
+def test_libigl_loop_matrix(benchmark):
+    """libigl's Loop matrices of all levels, built before, times the vertices."""
+    igl = pytest.importorskip("igl")
+    benchmark.group, benchmark.name = "triangles", "libigl, Loop matrix"
+    mesh = control_mesh("triangles")
+    faces, matrices = np.asarray(mesh.faces[3]), []
+    for _ in range(LEVELS):
+        matrix, faces = igl.loop_matrix(int(faces.max()) + 1, faces)[:2]
+        matrices.append(matrix.astype(np.float32))
+    x = np.asarray(mesh.vertices, np.float32)
+    benchmark(lambda: functools.reduce(lambda x, matrix: matrix @ x, matrices, x))
+
+
+def test_trimesh_loop(benchmark):
+    """trimesh's Loop subdivision, which has no tables to build before."""
+    benchmark.group, benchmark.name = "triangles", "trimesh, Loop with its tables"
+    mesh = control_mesh("triangles")
+    arguments = (mesh.vertices, np.asarray(mesh.faces[3]), LEVELS)
+    benchmark.pedantic(trimesh.remesh.subdivide_loop, arguments, rounds=2, iterations=1)
+
+
+@pytest.mark.parametrize("kind", ["triangles", "quads"])
+def test_tables(benchmark, kind):
+    benchmark.group, benchmark.name = kind, "tables"
+    topology = benchmark.pedantic(js.build_topology, (control_mesh(kind), SCHEME, LEVELS), rounds=5, warmup_rounds=1)
+    tables = sum(leaf.nbytes for leaf in jax.tree.leaves(topology.levels))
+    n = jax.eval_shape(vertices, *prepared(kind)).shape[0]
+    benchmark.extra_info["bytes a refined vertex"] = round(tables / n, 1)
+
+
+@pytest.mark.parametrize("kind", ["triangles", "quads"])
+def test_memory(benchmark, kind):
+    """What the compiled programs need beside arguments and results, over the bytes of the refined vertices."""
+    benchmark.group, benchmark.name = kind, "temporary memory (see the extra figures)"
+    out = jax.eval_shape(vertices, *prepared(kind)).size * 4
+    for work in ("vertices", "gradient"):
+        needs = jax.jit(WORK[work]).lower(*prepared(kind)).compile().memory_analysis().temp_size_in_bytes
+        benchmark.extra_info[f"temporaries over output, {work}"] = round(needs / out, 2)
+    benchmark(lambda: None)
+
+
+@pytest.mark.parametrize("work", ["evaluate", "value and gradient"])
+def test_evaluate(benchmark, work):
+    """20,000 places on 20,480 triangles."""
+    benchmark.group, benchmark.name = "20,000 points", work
+    topology = js.build_topology(control_mesh("triangles"), SCHEME, 1)
+    surface = js.refine(SCHEME, topology, prepared("triangles")[1])
+    points = js.sample(surface, 20_000, jax.random.key(0)).points
+    at = fitting.closest_points(surface, np.asarray(points))
+
+    def squared(vertices):
+        away = js.evaluate(js.RefinedSurface(vertices, surface.normals, surface.faces), at).points - points
+        return jnp.vdot(away, away)
+
+    function = {"evaluate": lambda vertices: squared(vertices), "value and gradient": jax.value_and_grad(squared)}[work]
+    run(benchmark, jax.jit(function), surface.vertices)
+
+
+FIRST_CALL = """
+import sys, time, jax, jax.numpy as jnp, trimesh, jaxsubdiv as js
+if sys.argv[2]:
+    jax.config.update("jax_compilation_cache_dir", sys.argv[2])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+ball = trimesh.creation.icosphere(1)
+mesh, scheme = js.ControlMesh(ball.vertices, ball.faces), js.Interpolating()
+topology, control = js.build_topology(mesh, scheme, int(sys.argv[3])), mesh.control()
+def value(control):
+    x = js.refine(scheme, topology, control).vertices
+    return jnp.vdot(x, x)
+jnp.zeros(3).block_until_ready()
+start = time.perf_counter()
+jax.block_until_ready(jax.jit(jax.grad(value) if sys.argv[1] == "gradient" else value)(control))
+print(time.perf_counter() - start)
+"""
+
+
+@pytest.mark.parametrize("levels", [2, 4])
+@pytest.mark.parametrize("work", ["forward", "gradient"])
+def test_first_call(benchmark, work, levels, tmp_path):
+    """Of a small mesh, in a new process: tracing and compiling; then again with the persistent cache filled."""
+    benchmark.group, benchmark.name = f"first call, {levels} levels", work
+
+    def seconds(cache: str) -> float:
+        command = [sys.executable, "-c", FIRST_CALL, work, cache, str(levels)]
+        return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+    seconds(str(tmp_path))
+    benchmark.extra_info["s, cold"] = round(seconds(""), 2)
+    benchmark.extra_info["s, warm cache"] = round(seconds(str(tmp_path)), 2)
+    benchmark(lambda: time.sleep(0))
