@@ -74,7 +74,7 @@ def main(path: str) -> None:
         ax.loglog(n, 1e3 * seconds, "o-", label=f"{name}: slope {slope:.2f} at the end")
     ax.set(xlabel="refined faces, or points", ylabel="ms")
     ax.grid(True, which="major", alpha=0.4)
-    ax.legend()
+    ax.legend(loc="lower right")
     figure.savefig(path, dpi=100)
 
 
