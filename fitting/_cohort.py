@@ -205,21 +205,11 @@ def fit_cohort(
             check(scheme, topology, control, scan)
         except ScanError as error:
             raise ScanError(f"scan {i}: {error}") from error
+    settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
     if priors.bend is None and pilot is None:
-        options = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
-        pilot = fit(scheme, topology, controls[0], scans[0], throw=False, **options)
+        pilot = fit(scheme, topology, controls[0], scans[0], throw=False, **settings)
     controls = [js.Control(one.vertices, given_normals(topology, one)) for one in controls]
-    recipe = Recipe(
-        scheme,
-        len(topology.levels),
-        free,
-        priors,
-        loss,
-        max_sweeps,
-        tolerance,
-        topology.mesh_normals,
-        topology.limit is not None,
-    )
+    recipe = Recipe.of(scheme, topology, **settings)
     problem = Problem(scheme, topology, controls[0], free, priors)
     problem.tell(_strength(problem, priors, pilot))
     dtype, masks = controls[0].vertices.dtype, free.of(scheme, topology.n_control_vertices)

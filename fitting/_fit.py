@@ -99,17 +99,8 @@ def fit(
     # Made here and not in the signature: arrays made while a module loads would settle JAX's device and precision.
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
     control = js.Control(control.vertices, given_normals(topology, control))
-    recipe = Recipe(
-        scheme,
-        len(topology.levels),
-        free,
-        priors,
-        loss,
-        max_sweeps,
-        tolerance,
-        topology.mesh_normals,
-        topology.limit is not None,
-    )
+    settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
+    recipe = Recipe.of(scheme, topology, **settings)
     start = control
     surface = js.refine(scheme, topology, control)
     open_vertices, edge = boundary_vertices(surface), float(edge_length(topology, control.vertices))

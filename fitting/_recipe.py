@@ -81,6 +81,12 @@ class Recipe:
         """Tables of a control mesh, as `fit` needs them."""
         return js.build_topology(mesh, self.scheme, self.levels, mesh_normals=self.mesh_normals, limit=self.limit)
 
+    @staticmethod
+    def of(scheme: js.AbstractScheme, topology: js.Topology, **settings: Any) -> "Recipe":
+        """The recipe of a fit on these tables; `settings` are the other attributes."""
+        of_tables = {"mesh_normals": topology.mesh_normals, "limit": topology.limit is not None}
+        return Recipe(scheme, len(topology.levels), **of_tables, **settings)
+
     def to_json(self) -> str:
         """The recipe as JSON text, exact to the last bit. Infinite numbers, which JSON does not have, are words.
 
