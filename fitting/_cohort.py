@@ -176,8 +176,8 @@ def fit_cohort(
 ) -> Cohort:
     """Fit one control mesh to many scans, in one compiled call.
 
-    Compiling takes as long as several fits, and is done again for another number of subjects. After that a fit of 2,500
-    points with 250 control vertices took 0.7 s of a CPU core, against 3.7 s by `fit`, and was as near to the truth.
+    Compiling takes as long as several fits, and is done again for another number of subjects. After that each takes a
+    fraction of the time of `fit`, and is as near to the truth.
 
     Args:
         scheme, topology: as in `fit`.

@@ -14,6 +14,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import meshes
 import numpy as np
 import pytest
 import trimesh
@@ -33,7 +34,7 @@ js.keep_freed_memory()
 
 @functools.cache
 def control_mesh(kind: str) -> js.ControlMesh:
-    """5,120 triangles, 6,144 quads, half of each, or the triangles in a random order, on a sphere."""
+    """5,120 triangles on a sphere, in order or shuffled; 6,144 quads on a torus, or half of them cut in two."""
     ball = trimesh.creation.icosphere(4)
     if kind == "triangles":
         return js.ControlMesh(ball.vertices, ball.faces)
@@ -41,20 +42,7 @@ def control_mesh(kind: str) -> js.ControlMesh:
         rng = np.random.default_rng(0)
         order, faces = rng.permutation(len(ball.vertices)), rng.permutation(ball.faces)
         return js.ControlMesh(ball.vertices[order], np.argsort(order)[faces])
-    u, v = (grid.ravel() for grid in np.meshgrid(np.arange(96), np.arange(64), indexing="ij"))
-    vertices = torus(2 * np.pi * u / 96, 2 * np.pi * v / 64)
-    corners = [(u, v), (u + 1, v), (u + 1, v + 1), (u, v + 1)]
-    quads = np.stack([(a % 96) * 64 + b % 64 for a, b in corners], axis=1)
-    if kind == "quads":
-        return js.ControlMesh(vertices, quads)
-    half = len(quads) // 2
-    cut = quads[half:][:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
-    return js.ControlMesh(vertices, [*quads[:half].tolist(), *cut.tolist()])
-
-
-def torus(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    around = 2 + np.cos(v)
-    return np.stack([around * np.cos(u), around * np.sin(u), np.sin(v)], axis=1)
+    return js.ControlMesh(*meshes.torus(96, 64, kind.removesuffix("s")))
 
 
 @functools.cache

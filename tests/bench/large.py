@@ -8,20 +8,11 @@ import time
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+import trimesh
 
 import jaxsubdiv as js
 
 LEVELS = 8
-
-
-def torus() -> js.ControlMesh:
-    u, v = (grid.ravel() for grid in np.meshgrid(np.arange(16), np.arange(16), indexing="ij"))
-    around, angle = 2 + np.cos(v * np.pi / 8), u * np.pi / 8
-    vertices = np.stack([around * np.cos(angle), around * np.sin(angle), np.sin(v * np.pi / 8)], axis=1)
-    corners = [(u, v), (u + 1, v), (u + 1, v + 1), (u, v + 1)]
-    quads = np.stack([(a % 16) * 16 + b % 16 for a, b in corners], axis=1)
-    return js.ControlMesh(vertices, quads).triangulated()
 
 
 @jax.jit
@@ -30,7 +21,8 @@ def gradient(topology: js.Topology, control: js.Control) -> js.Control:
 
 
 def main() -> None:
-    mesh, start = torus(), time.perf_counter()
+    ring = trimesh.creation.torus(2, 1, 16, 16)
+    mesh, start = js.ControlMesh(ring.vertices, ring.faces), time.perf_counter()
     topology = js.build_topology(mesh, js.Interpolating(), LEVELS)
     print(f"{len(topology.faces[3]):,} faces; tables {time.perf_counter() - start:.1f} s")
     control = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), mesh.control())
