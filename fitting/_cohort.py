@@ -289,8 +289,8 @@ def _stacked(controls: list[js.Control], scans: Sequence[Scan], at_once: int) ->
             jnp.pad(scan.relative_deviations(), (0, size - scan.n_points), constant_values=1),
         )
         whole = eqx.tree_at(lambda s: tuple(vars(s).values()), scan, filled_up, is_leaf=lambda leaf: leaf is None)
-        neighbours = filled(jnp.asarray(around.neighbours, jnp.int32))
-        full = Surroundings(filled(jnp.asarray(around.crowded)), filled(jnp.asarray(around.trusted)), neighbours)
+        around = around._replace(neighbours=np.asarray(around.neighbours, np.int32))
+        full = Surroundings(*(filled(jnp.asarray(rows)) for rows in around))
         return _Subject(control, whole, full, jnp.asarray(scan.n_points / size, scan.points.dtype))
 
     one_each = [subject(*pair) for pair in zip(controls, scans, strict=True)]

@@ -13,7 +13,7 @@ from jaxsubdiv._linalg import dot, norm, unit
 from jaxsubdiv._surface import corner_weights
 
 from ._correspondence import closest_points, nearest_rows
-from ._outliers import dense_points
+from ._outliers import dense_points, scattered_points
 from ._residuals import Pairs
 from ._robust import AbstractLoss, noise_scale
 from ._scan import Scan
@@ -52,6 +52,8 @@ class Surroundings(NamedTuple):
 
     crowded: Bool[Array | np.ndarray, "p"]
     """Whether other points are near, as they are not around scattered outliers."""
+    scattered: Bool[Array | np.ndarray, "p"]
+    """Whether it and the points near it lie in space, on no surface: it has no say."""
     trusted: Bool[Array | np.ndarray, "p"]
     """Whether what it has in common with its neighbours counts: in a scan of few scattered points, where crowded."""
     neighbours: Int[Array | np.ndarray, "p k"]
@@ -62,13 +64,15 @@ def surroundings(scan: Scan) -> Surroundings:
     """The surroundings of a scan, which stay what they are while the surface moves."""
     counted = np.flatnonzero(np.asarray(scan.weights_or_ones()) > 0)  # the others are as if they were not there
     points = np.asarray(scan.points)[counted]
-    crowded, neighbours = np.zeros(scan.n_points, bool), np.zeros((scan.n_points, 1), np.int32)
+    crowded, scattered = np.zeros((2, scan.n_points), bool)
     crowded[counted] = dense_points(points)
+    scattered[counted] = scattered_points(points, crowded[counted])
+    neighbours = np.zeros((scan.n_points, 1), np.int32)
     if len(counted) > 1:
         _, rows = nearest_rows(KDTree(points), points, min(_NEIGHBOURS + 1, len(points)))
         neighbours = np.zeros((scan.n_points, rows.shape[1] - 1), np.int32)
         neighbours[counted] = counted[rows[:, 1:]]
-    return Surroundings(crowded, crowded & (crowded.sum() > _CLEAN * len(counted)), neighbours)
+    return Surroundings(crowded, scattered, crowded & (crowded.sum() > _CLEAN * len(counted)), neighbours)
 
 
 def look(
@@ -107,7 +111,8 @@ def measure(
 ) -> Look:
     on, normals = js.evaluate(surface, at)
     away = scan.points - on
-    distance, given, spread = norm(away)[:, 0], scan.weights_or_ones(), scan.relative_deviations()
+    distance, spread = norm(away)[:, 0], scan.relative_deviations()
+    given = jnp.where(around.scattered, 0.0, scan.weights_or_ones())
     corners, inside = corner_weights(surface, at)
     at_boundary = jnp.sum(jnp.where(open_vertices[corners], inside, 0.0), axis=1) > 1 - _ON_BOUNDARY
     if scan.normals is not None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fitting import Barron, Huber, LeastSquares, Tukey, cauchy, geman_mcclure
+from fitting._outliers import dense_points, scattered_points
 from fitting._robust import noise_scale
 
 R = np.linspace(-12, 12, 97)
@@ -65,3 +66,28 @@ def test_points_without_weight_have_no_say_in_the_noise():
 
 def test_no_distances_are_no_noise():
     assert noise_scale(jnp.zeros(10), jnp.ones(10)) == 0
+
+
+@pytest.mark.parametrize("outliers", [0.05, 0.2, 0.6])
+def test_scattered_points_are_told_from_a_surface(outliers):
+    rng, n = np.random.default_rng(0), 8000
+    n_out = round(outliers * n)
+    ball = rng.normal(size=(n - n_out, 3))
+    ball = 100 * ball / np.linalg.norm(ball, axis=1, keepdims=True) + rng.normal(scale=0.5, size=ball.shape)
+    points = np.concatenate([ball, rng.uniform(-120, 120, (n_out, 3))])
+    found = scattered_points(points, dense_points(points))
+    assert found[: len(ball)].mean() < 0.002
+    assert found[len(ball) :].mean() > 0.6  # those that lie close to the surface cannot be told so
+
+
+def test_a_sparse_part_of_a_surface_and_a_line_are_not_scattered():
+    rng = np.random.default_rng(0)
+    dense, sparse = rng.uniform(-50, 50, (5000, 2)), rng.uniform(50, 250, (300, 2))
+    line = np.stack([np.linspace(300, 500, 40), rng.normal(scale=0.3, size=40), rng.normal(scale=0.3, size=40)], axis=1)
+    sheet = np.concatenate([dense, sparse])
+    points = np.concatenate(
+        [np.c_[sheet, 0.002 * (sheet**2).sum(axis=1) ** 0.5 + rng.normal(scale=0.3, size=5300)], line]
+    )
+    is_dense = dense_points(points)
+    assert is_dense[5000:].mean() < 0.2  # they would all be taken for outliers by how thinly they lie
+    assert scattered_points(points, is_dense).mean() < 0.003
