@@ -7,7 +7,8 @@ from scipy.spatial import KDTree
 from ._correspondence import nearest_rows
 
 _NEIGHBOURS = 10
-_AROUND, _THICK = 16, 1 / 3  # 95 % and more of points in a ball have neighbours so thick, 7 % of a sparse hand-traced head
+# 95 % and more of the points in a ball have neighbours so thick, of the sparse points of a hand-traced head 7 %.
+_AROUND, _THICK = 16, 1 / 3
 _LOW = 0.2  # with 60 % of outliers a third of the surface's own points still lies below this quantile
 
 
