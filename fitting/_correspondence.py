@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 from jaxsubdiv import RefinedSurface, SurfacePoint
 from jaxsubdiv._half_edges import half_edges
 
-_FIRST_CANDIDATES = 8
+_FIRST_CANDIDATES = 20  # enough for nearly all points near the surface
 _MORE_CANDIDATES = 4  # times as many, for the points whose closest face is not certain yet
 _PAIRS_AT_ONCE = 2_000_000  # bounds the memory to a few hundred MB, however large scan and surface are
 _LARGE, _MOST_PARTS = 1.5, 24  # times the usual size: a larger triangle stands in the tree in parts, to so many a side
@@ -87,19 +87,20 @@ def _nearest_triangle(
         left = []
         for rows in np.array_split(unsure, -(-len(unsure) * k // _PAIRS_AT_ONCE)):
             to_centre, candidates = nearest_rows(tree, points[rows], k)
-            # A part lies within its radius of its centre: what is farther by more is not worth a look.
-            near = to_centre - centres.radius[candidates] <= np.sqrt(squared[rows])[:, None]
-            point, column = np.nonzero(near)
-            triangle = centres.triangle[candidates[point, column]]
-            corner, ab, ac = (values[:, triangle] for values in triangles)
-            found, *places = triangle_distance(corner, ab, ac, points[rows[point]].T)
-            places = np.stack(places, axis=-1)
-            order = np.lexsort((found, point))
-            first = order[np.searchsorted(point[order], np.unique(point))]
-            row = rows[point[first]]
-            closer = found[first] < squared[row]
-            row, first = row[closer], first[closer]
-            nearest[row], uv[row], squared[row] = triangle[first], places[first], found[first]
+            for columns in (slice(0, 1), slice(1, None)):  # the nearest centre's triangle spares most of the others
+                # A part lies within its radius of its centre: what is farther by more is not worth a look.
+                reached = to_centre[:, columns] - centres.radius[candidates[:, columns]]
+                point, column = np.nonzero(reached <= np.sqrt(squared[rows])[:, None])
+                triangle = centres.triangle[candidates[point, columns.start + column]]
+                corner, ab, ac = (values[:, triangle] for values in triangles)
+                found, *places = triangle_distance(corner, ab, ac, points[rows[point]].T)
+                closer = found < squared[rows[point]]
+                best = np.full(len(rows), np.inf)
+                np.minimum.at(best, point[closer], found[closer])
+                first = np.flatnonzero(closer & (found == best[point]))[::-1]  # of equals the first is written last
+                row = rows[point[first]]
+                nearest[row], squared[row] = triangle[first], found[first]
+                uv[row] = np.stack([place[first] for place in places], axis=-1)
             # Where the last centre is farther than the closest face and the reach, no face was missed.
             left.append(rows[np.sqrt(squared[rows]) * (1 + 1e-9) + reach > to_centre[:, -1]])
         unsure = np.concatenate(left) if k < len(centres.points) else np.zeros(0, np.int64)
