@@ -1,4 +1,4 @@
-"""How fast refinement is: beside C++, libigl and trimesh on the same work in the same run, and against its own parts.
+"""How fast refinement is: beside C++, OpenSubdiv, libigl and trimesh on the same work in the same run, and against its own parts.
 
     pip install -e '.[bench]' && pytest tests/bench/bench_refine.py
 
@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import trimesh
 from gathers import Gathers
+from opensubdiv import OpenSubdiv
 
 import fitting
 import jaxsubdiv as js
@@ -114,6 +115,24 @@ def test_floor(benchmark, kind):
     source = np.zeros((read + out.size * 4) // 2, np.uint8)
     target = np.zeros_like(source)
     benchmark(np.copyto, target, source)
+
+
+@pytest.mark.parametrize("kind", ["triangles", "quads"])
+@pytest.mark.parametrize("way", ["stencils", "levels"])
+def test_opensubdiv(benchmark, way, kind):
+    """Loop's scheme, Catmull and Clark's: factorised stencils on all cores, or level by level on one."""
+    benchmark.group, benchmark.name = kind, f"OpenSubdiv, {way}"
+    try:
+        peer = OpenSubdiv(control_mesh(kind), LEVELS, stencils=way == "stencils")
+    except (OSError, subprocess.CalledProcessError) as error:
+        pytest.skip(f"no OpenSubdiv to build with (Debian: libosd-dev): {error}")
+    peer.run()
+    scheme = js.Loop() if kind == "triangles" else js.CatmullClark()
+    topology = js.build_topology(control_mesh(kind), scheme, LEVELS)
+    ours = np.asarray(js.refine(scheme, topology, prepared(kind)[1]).vertices)
+    assert peer.vertices.shape == ours.shape
+    np.testing.assert_allclose(np.sort(peer.vertices, axis=0), np.sort(ours, axis=0), atol=1e-5)
+    benchmark(peer.run)
 
 
 def test_libigl_loop_matrix(benchmark):

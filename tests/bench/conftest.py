@@ -4,6 +4,8 @@ RATIOS = (
     ("vertices, over C++", "jaxsubdiv, vertices", "C++, vertices"),
     ("with normals, over C++", "jaxsubdiv, normals", "C++, normals"),
     ("libigl's Loop matrix over ours", "libigl, Loop matrix", "jaxsubdiv, vertices"),
+    ("OpenSubdiv's stencils over ours", "OpenSubdiv, stencils", "jaxsubdiv, vertices"),
+    ("OpenSubdiv's levels over ours", "OpenSubdiv, levels", "jaxsubdiv, vertices"),
     ("trimesh's Loop over ours with tables", "trimesh, Loop with its tables", "tables"),
     ("vertices, over the floor", "jaxsubdiv, vertices", "floor"),
     ("value and gradient over vertices", "jaxsubdiv, gradient", "jaxsubdiv, vertices"),

@@ -10,16 +10,19 @@ import numpy as np
 
 import jaxsubdiv as js
 
-SOURCE = Path(__file__).with_suffix(".cpp")
 FLAGS = ("-O3", "-march=native", "-ffast-math", "-fopenmp", "-shared", "-fPIC")
 
 
 @functools.cache
-def library() -> ctypes.CDLL:
+def built(source: Path, *libraries: str) -> ctypes.CDLL:
     with tempfile.TemporaryDirectory() as folder:
-        built = Path(folder) / "gathers.so"
-        subprocess.run(["g++", *FLAGS, str(SOURCE), "-o", str(built)], check=True)
-        return ctypes.CDLL(str(built))
+        shared = Path(folder) / "shared.so"
+        subprocess.run(["g++", *FLAGS, str(source), "-o", str(shared), *libraries], check=True)
+        return ctypes.CDLL(str(shared))
+
+
+def library() -> ctypes.CDLL:
+    return built(Path(__file__).with_suffix(".cpp"))
 
 
 def _at(table: np.ndarray) -> ctypes.c_void_p:
