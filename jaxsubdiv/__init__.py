@@ -20,6 +20,8 @@ from ._memory import keep_freed_memory as keep_freed_memory
 from ._mesh import ControlMesh as ControlMesh
 from ._normals import estimate_normals as estimate_normals
 from ._refine import refine as refine
+from ._saved_topology import load_topology as load_topology
+from ._saved_topology import save_topology as save_topology
 from ._scheme.base import AbstractScheme as AbstractScheme
 from ._scheme.bezier_triangle import BezierTriangle as BezierTriangle
 from ._scheme.butterfly import ModifiedButterfly as ModifiedButterfly

@@ -1,4 +1,4 @@
-"""How fast refinement is: beside C++, OpenSubdiv, libigl and trimesh on the same work in the same run, and against its own parts.
+"""How fast refinement is: beside C++, OpenSubdiv, libigl and trimesh on the same work in one run, and its own parts.
 
     pip install -e '.[bench]' && pytest tests/bench/bench_refine.py
 
@@ -157,12 +157,16 @@ def test_trimesh_loop(benchmark):
 
 
 @pytest.mark.parametrize("kind", ["triangles", "quads"])
-def test_tables(benchmark, kind):
+def test_tables(benchmark, kind, tmp_path):
     benchmark.group, benchmark.name = kind, "tables"
     topology = benchmark.pedantic(js.build_topology, (control_mesh(kind), SCHEME, LEVELS), rounds=5, warmup_rounds=1)
     tables = sum(leaf.nbytes for leaf in jax.tree.leaves(topology.levels))
     n = jax.eval_shape(vertices, *prepared(kind)).shape[0]
     benchmark.extra_info["bytes a refined vertex"] = round(tables / n, 1)
+    js.save_topology(tmp_path / "tables.npz", topology)
+    start = time.perf_counter()
+    jax.block_until_ready(js.load_topology(tmp_path / "tables.npz"))
+    benchmark.extra_info["s to load the tables"] = round(time.perf_counter() - start, 3)
 
 
 @pytest.mark.parametrize("kind", ["triangles", "quads"])

@@ -1,4 +1,4 @@
-"""Where the time of a fit goes: its sweeps, part by part, and its start, with an empty compilation cache and a warm one.
+"""Where the time of a fit goes: its sweeps, part by part, and its start, with an empty compilation cache and a warm.
 
     python tests/bench/fit_parts.py                          # the head fragment that ships
     python tests/bench/fit_parts.py SCAN --control MESH      # files in mm, aligned
@@ -10,6 +10,7 @@ parts" is what no part accounts for.
 import argparse
 import functools
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -123,7 +124,9 @@ def tables(cold: dict, warm: dict) -> str:
     beside = warm["sweeps"]["beside the parts"][0]
     lines += ["", f"The whole over the sum of its parts: {whole / (whole - beside):.2f}", ""]
     lines += ["| start, s | empty cache | warm cache |", "|---|---|---|"]
-    rows = {name: [run["first call"].get(name, 0.0) for run in (cold, warm)] for name in ("imports", "reading", "tables")}
+    rows = {
+        name: [run["first call"].get(name, 0.0) for run in (cold, warm)] for name in ("imports", "reading", "tables")
+    }
     for stage in STAGES.values():
         rows[f"programs {stage}"] = [run["compiling"].get(stage, 0.0) for run in (cold, warm)]
     counted = [sum(values[i] for values in rows.values()) for i in range(2)]
@@ -147,7 +150,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as cache:
         for _ in range(2):
             command = [sys.executable, __file__, "--one-process", *sys.argv[1:]]
-            environment = {**__import__("os").environ, "JAX_COMPILATION_CACHE_DIR": cache}
+            environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": cache}
             done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
             runs.append(json.loads(done.stdout.splitlines()[-1]))
     print(tables(*runs))

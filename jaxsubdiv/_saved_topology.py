@@ -1,0 +1,93 @@
+"""Topologies as files: an array a table, and one text that says how they belong together."""
+
+import dataclasses
+import json
+import os
+import zipfile
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from ._fans import Fan, Fans
+from ._files import replacing
+from ._masks import MaskGroup, Masks
+from ._scheme.bezier_triangle import PatchLevel, Places
+from ._topology import Level, LimitMasks, MaskLevel, Topology
+
+_VERSION = 1
+_KINDS = {
+    kind.__name__: kind
+    for kind in (Topology, Level, MaskLevel, PatchLevel, LimitMasks, Masks, MaskGroup, Fans, Fan, Places)
+}
+
+
+def save_topology(path: str | os.PathLike[str], topology: Topology) -> None:
+    """Write a topology to an `.npz` file, complete or not at all, for `load_topology`.
+
+    Raises:
+        ValueError: the topology holds tables of a level class of your own.
+        OSError: the file cannot be written.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    text = json.dumps({"version": _VERSION, "tables": _plain(topology, arrays)})
+    with replacing(path) as unfinished, open(unfinished, "wb") as file:
+        np.savez(file, about=np.array(text), **arrays)
+
+
+def load_topology(path: str | os.PathLike[str]) -> Topology:
+    """The topology that `save_topology` wrote, as it was.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is damaged, of a later version, or no topology; the text names it and says what is wrong.
+    """
+    try:
+        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
+            arrays = dict(file)
+        about = json.loads(str(arrays["about"]))
+        if about["version"] != _VERSION:
+            raise ValueError(
+                f"a topology of version {about['version']!r}, but this release reads {_VERSION}. Update it."
+            )
+        topology = _built(about["tables"], arrays)
+    except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{os.fspath(path)}: no saved topology, or a damaged one: {error}") from None
+    if not isinstance(topology, Topology):
+        raise ValueError(f"{os.fspath(path)}: no saved topology.")
+    return topology
+
+
+def _plain(value: Any, arrays: dict[str, np.ndarray]) -> Any:
+    """A value as JSON has it; its arrays go to `arrays`, and their names stay."""
+    if isinstance(value, eqx.Module):
+        name = type(value).__name__
+        if _KINDS.get(name) is not type(value):
+            raise ValueError(f"a topology with {name} has no file format; those of the package's schemes do.")
+        return {"kind": name} | {field: _plain(part, arrays) for field, part in vars(value).items()}
+    if isinstance(value, jax.Array):
+        name = f"table_{len(arrays)}"
+        arrays[name] = np.asarray(value)
+        return {"array": name}
+    if isinstance(value, tuple):
+        return [_plain(part, arrays) for part in value]
+    if isinstance(value, dict):  # faces by their number of corners
+        return {"faces": {str(size): _plain(part, arrays) for size, part in value.items()}}
+    return value
+
+
+def _built(value: Any, arrays: dict[str, np.ndarray]) -> Any:
+    if isinstance(value, list):
+        return tuple(_built(part, arrays) for part in value)
+    if not isinstance(value, dict):
+        return value
+    if "array" in value:
+        return jax.numpy.asarray(arrays[value["array"]])
+    if "kind" not in value:
+        return {int(size): _built(part, arrays) for size, part in value["faces"].items()}
+    kind = _KINDS[value["kind"]]
+    module = object.__new__(kind)  # past the converters, which take the arrays of numpy that tables are built from
+    for field in dataclasses.fields(kind):
+        object.__setattr__(module, field.name, _built(value[field.name], arrays))
+    return module
