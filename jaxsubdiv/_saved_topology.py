@@ -30,7 +30,7 @@ def save_topology(path: str | os.PathLike[str], topology: Topology) -> None:
         ValueError: the topology holds tables of a level class of your own.
         OSError: the file cannot be written.
     """
-    arrays: dict[str, np.ndarray] = {}
+    arrays: dict[str, Any] = {}
     text = json.dumps({"version": _VERSION, "tables": _plain(topology, arrays)})
     with replacing(path) as unfinished, open(unfinished, "wb") as file:
         np.savez(file, about=np.array(text), **arrays)
@@ -59,7 +59,7 @@ def load_topology(path: str | os.PathLike[str]) -> Topology:
     return topology
 
 
-def _plain(value: Any, arrays: dict[str, np.ndarray]) -> Any:
+def _plain(value: Any, arrays: dict[str, Any]) -> Any:
     """A value as JSON has it; its arrays go to `arrays`, and their names stay."""
     if isinstance(value, eqx.Module):
         name = type(value).__name__
