@@ -59,6 +59,7 @@ class Recipe:
     loss: AbstractLoss = dataclasses.field(default_factory=geman_mcclure)
     max_sweeps: int = 60
     tolerance: float = 0.1
+    landmark_deviation: float = 1.0
     mesh_normals: bool = False
     limit: bool = False
 
