@@ -188,9 +188,9 @@ def _recalled(
     before: dict[str, np.ndarray], problem: Problem, scheme: js.AbstractScheme, control: js.Control, seen: Look
 ) -> tuple[js.AbstractScheme, js.Control, list[float], list[float]]:
     """Scheme, control and RMS distances of a fit that was stopped; its problem takes up what it knew."""
-    memory = {name: before[name] for name in Memory._fields}
-    memory |= {"determined": float(memory["determined"]), "annealed": bool(memory["annealed"])}
-    problem.recall(Memory(**memory), scheme, control, seen)
+    memory = Memory._make(before[name] for name in Memory._fields)
+    memory = memory._replace(determined=float(memory.determined), annealed=bool(memory.annealed))
+    problem.recall(memory, scheme, control, seen)
     if scheme.h is not None:
         scheme = eqx.tree_at(lambda s: s.h, scheme, jnp.asarray(before["h"]))
     control = js.Control(jnp.asarray(before["vertices"]), jnp.asarray(before["normals"]))

@@ -9,6 +9,7 @@ import fitting
 import jaxsubdiv as js
 from fitting import Free, Priors
 from fitting._fit import CHECKPOINT
+from fitting._fit_scan import CHECKPOINT_START
 
 
 class Stopped(Exception):
@@ -40,7 +41,6 @@ OPTIONS = {
     "smoothness from the scan": {},
     "smoothness as given": {"priors": Priors(bend=0.3)},
     "some vertices, no normals": {"free": Free(vertices=np.arange(12) > 3, normals=False)},
-    "landmarks": {"landmarks": fitting.Landmarks(np.eye(3) * 20, [0, 1, 2]), "landmark_deviation": 2.0},
 }
 
 
@@ -108,6 +108,67 @@ def test_checkpoint_that_is_broken_is_refused_by_its_name(stopped):
     file.write_bytes(file.read_bytes()[:500])
     with pytest.raises(ValueError, match=r"checkpoint\.npz is no checkpoint: .* Delete it to start anew"):
         problem().fit(points(), checkpoint=stopped)
+
+
+# From the scan on
+
+
+def start() -> js.ControlMesh:
+    return js.ControlMesh(problem().start.vertices, problem().mesh.faces, problem().start.normals)
+
+
+def rippled() -> fitting.Scan:
+    """What twelve control vertices cannot follow."""
+    p = problem().points
+    return fitting.Scan(p + 0.4 * np.sin(p[:, :1] / 3) * p / np.linalg.norm(p, axis=1, keepdims=True) + 0.1 * noise())
+
+
+def test_stopped_fit_of_a_scan_goes_on_without_alignment_and_first_fit(tmp_path):
+    """Stopped after a split: only the second fit goes on."""
+    how = {"levels": 1, "tolerance_mm": 0.08, "max_sweeps": 6, "throw": False, "checkpoint": tmp_path}
+    whole = fitting.fit_scan(rippled(), start(), **(how | {"checkpoint": None}))
+    stages = []
+
+    def stop(sweep: fitting.Sweep) -> None:
+        if len(stages) == 3 and sweep.number > 2:  # alignment, a fit, and the fit after the split
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        fitting.fit_scan(rippled(), start(), on_stage=stages.append, on_sweep=stop, **how)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [CHECKPOINT, CHECKPOINT_START]
+    again_stages, numbers = [], []
+    again = fitting.fit_scan(
+        rippled(), start(), on_stage=again_stages.append, on_sweep=lambda s: numbers.append(s.number), **how
+    )
+    assert again_stages[:2] == ["goes on where it was stopped", stages[2]] and numbers[0] == 3
+    assert (again.splits, again.outcome) == (whole.splits, whole.outcome) and again.splits >= 1
+    for part in ("control", "scheme", "at", "distances", "rms"):
+        same(getattr(again.result, part), getattr(whole.result, part))
+    np.testing.assert_array_equal(again.start.vertices, whole.start.vertices)
+    for found, expected in zip(again.alignment, whole.alignment, strict=True):
+        if isinstance(expected, js.ControlMesh):
+            found, expected = found.vertices, expected.vertices
+        np.testing.assert_array_equal(found, expected)
+    assert again.result.recipe.to_json() == whole.result.recipe.to_json()
+    assert not list(tmp_path.iterdir())
+
+
+def test_checkpoint_of_another_scan_fit_is_refused_by_what_differs(tmp_path):
+    how = {"levels": 1, "pose": None, "throw": False, "checkpoint": tmp_path}
+    with pytest.raises(Stopped):
+        fitting.fit_scan(fitting.Scan(points()), start(), on_sweep=after(1), **how)
+    before = sorted(tmp_path.iterdir())
+    moved = js.ControlMesh(start().vertices + 1, start().faces)
+    for name, change in (("mesh", {"mesh": moved}), ("faces", {"faces": 20}), ("priors", {"priors": Priors(h=0.1)})):
+        with pytest.raises(ValueError, match=f"checkpoint_start.npz is of another fit, with another {name}"):
+            fitting.fit_scan(**({"scan": fitting.Scan(points()), "mesh": start()} | how | change))
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_what_cannot_be_fitted_leaves_no_checkpoint(tmp_path):
+    with pytest.raises(fitting.ScanError, match="all scan points lie on one spot"):
+        fitting.fit_scan(fitting.Scan(np.ones((20, 3))), start(), pose=None, levels=1, checkpoint=tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_fit_without_a_checkpoint_writes_nothing(tmp_path, monkeypatch):
