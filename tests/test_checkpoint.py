@@ -9,7 +9,6 @@ import fitting
 import jaxsubdiv as js
 from fitting import Free, Priors
 from fitting._fit import CHECKPOINT
-from fitting._fit_scan import CHECKPOINT_START
 
 
 class Stopped(Exception):
@@ -115,42 +114,6 @@ def test_checkpoint_that_is_broken_is_refused_by_its_name(stopped):
 
 def start() -> js.ControlMesh:
     return js.ControlMesh(problem().start.vertices, problem().mesh.faces, problem().start.normals)
-
-
-def rippled() -> fitting.Scan:
-    """What twelve control vertices cannot follow."""
-    p = problem().points
-    return fitting.Scan(p + 0.4 * np.sin(p[:, :1] / 3) * p / np.linalg.norm(p, axis=1, keepdims=True) + 0.1 * noise())
-
-
-def test_stopped_fit_of_a_scan_goes_on_without_alignment_and_first_fit(tmp_path):
-    """Stopped after a split: only the second fit goes on."""
-    how = {"levels": 1, "tolerance_mm": 0.08, "max_sweeps": 6, "throw": False, "checkpoint": tmp_path}
-    whole = fitting.fit_scan(rippled(), start(), **(how | {"checkpoint": None}))
-    stages = []
-
-    def stop(sweep: fitting.Sweep) -> None:
-        if len(stages) == 3 and sweep.number > 2:  # alignment, a fit, and the fit after the split
-            raise Stopped
-
-    with pytest.raises(Stopped):
-        fitting.fit_scan(rippled(), start(), on_stage=stages.append, on_sweep=stop, **how)
-    assert sorted(path.name for path in tmp_path.iterdir()) == [CHECKPOINT, CHECKPOINT_START]
-    again_stages, numbers = [], []
-    again = fitting.fit_scan(
-        rippled(), start(), on_stage=again_stages.append, on_sweep=lambda s: numbers.append(s.number), **how
-    )
-    assert again_stages[:2] == ["goes on where it was stopped", stages[2]] and numbers[0] == 3
-    assert (again.splits, again.outcome) == (whole.splits, whole.outcome) and again.splits >= 1
-    for part in ("control", "scheme", "at", "distances", "rms"):
-        same(getattr(again.result, part), getattr(whole.result, part))
-    np.testing.assert_array_equal(again.start.vertices, whole.start.vertices)
-    for found, expected in zip(again.alignment, whole.alignment, strict=True):
-        if isinstance(expected, js.ControlMesh):
-            found, expected = found.vertices, expected.vertices
-        np.testing.assert_array_equal(found, expected)
-    assert again.result.recipe.to_json() == whole.result.recipe.to_json()
-    assert not list(tmp_path.iterdir())
 
 
 def test_checkpoint_of_another_scan_fit_is_refused_by_what_differs(tmp_path):
