@@ -349,7 +349,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--scheme", choices=tuple(SCHEMES), help="default: interpolating")
     add("--h", type=float, help="tangent length coefficient at the start, for schemes that have one (default: 1)")
     add("--max-sweeps", type=int, help=f"pairing and solving in turns (default: {Recipe.max_sweeps})")
-    add("--recipe", metavar="FILE", help="recipe.json of a fit: its settings; files, --label and --scale are given again")
+    add("--recipe", metavar="FILE", help="recipe.json of a fit: its settings; files, --scale and --label are not in it")
     add("--resume", action="store_true", help="skip the scans that OUT has with the same points and settings")
     add("--example", choices=get_args(Example), default="head_fragment", help="which, without SCAN")
     return parser
