@@ -2,8 +2,8 @@
 
 from ._align import Alignment as Alignment
 from ._align import align as align
-from ._cohort import Cohort as Cohort
 from ._cohort import fit_cohort as fit_cohort
+from ._cohort_record import Cohort as Cohort
 from ._control_mesh import control_mesh as control_mesh
 from ._correspondence import closest_points as closest_points
 from ._example import example as example

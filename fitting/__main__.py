@@ -2,7 +2,9 @@
 
 import argparse
 import csv
+import dataclasses
 import io
+import json
 import os
 import sys
 import time
@@ -10,9 +12,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple, get_args
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 
 import jaxsubdiv as js
 from jaxsubdiv._compare import SCHEMES
@@ -20,11 +23,14 @@ from jaxsubdiv._files import replacing
 from jaxsubdiv._warnings import plain_warnings
 
 from ._example import Example, example
-from ._fit import Sweep
-from ._fit_scan import ScanFit, fit_scan, misfit
+from ._fit import CHECKPOINT, Sweep
+from ._fit_scan import CHECKPOINT_START, ScanFit, misfit
 from ._landmarks import Landmarks, match_landmarks, read_landmarks
 from ._page import write_page
 from ._picture import draw_fit, surface_distances
+from ._recipe import Recipe, load_recipe
+from ._result import FitResult
+from ._saved import load
 from ._scan import Scan, read_scan
 
 _EXAMPLE_NOISE = 3.0  # mm: the example starts from a control mesh that is wrong, to show that the fit mends it
@@ -52,7 +58,7 @@ class _Job(NamedTuple):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; exit status 0, 1 where a fit did not converge, 2 where an input cannot be used."""
+    """The command line; exit status 0, 1 where a fit did not converge, 2 where an input cannot be used, 130 stopped."""
     parser = _parser()
     options = parser.parse_args(arguments)
     if options.control and not options.scans:
@@ -60,31 +66,51 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _keep_what_serves_again()
     with plain_warnings():
         try:
-            scans = _scan_files([Path(scan) for scan in options.scans])
-        except ValueError as error:
+            scans, recipe = _scan_files([Path(scan) for scan in options.scans]), _recipe(options)
+        except (ValueError, OSError) as error:
             print(f"error: {error}", file=sys.stderr)
             return 2
-        if len(scans) > 1:
-            return _run_all(scans, options)
-        scan = scans[0] if scans else None
-        folder = Path(options.output or f"fit_{scan.stem if scan else options.example}")
-        return _run(scan, folder, options)["status"]
+        try:
+            if len(scans) > 1:
+                return _run_all(scans, options, recipe)
+            scan = scans[0] if scans else None
+            folder = Path(options.output or f"fit_{scan.stem if scan else options.example}")
+            return _run(scan, folder, options, recipe)["status"]
+        except KeyboardInterrupt:
+            skips = "; with --resume it skips the scans that are done" if len(scans) > 1 else ""
+            print(f"\nstopped  the same command goes on from the last sweep{skips}", file=sys.stderr)
+            return 130
 
 
-def _run_all(scans: list[Path], options: argparse.Namespace) -> int:
+def _recipe(options: argparse.Namespace) -> Recipe:
+    """The settings: those of a recipe, or the defaults, and before them what was given beside it."""
+    recipe = Recipe(js.Interpolating()) if options.recipe is None else load_recipe(options.recipe)
+    scheme = recipe.scheme if options.scheme is None else SCHEMES[options.scheme]()
+    if options.h is not None:
+        if scheme.h is None:
+            raise ValueError(f"the scheme {type(scheme).__name__} has no h: leave --h out.")
+        scheme = eqx.tree_at(lambda s: s.h, scheme, jnp.asarray(options.h, scheme.h.dtype))
+    given = {name: getattr(options, name) for name in ("levels", "faces", "kind", "closed", "max_sweeps")}
+    given = {name: value for name, value in (given | {"tolerance_mm": options.tolerance}).items() if value is not None}
+    if options.align is not None:
+        given["pose"] = None if options.align == "none" else options.align
+    return dataclasses.replace(recipe, scheme=scheme, **given)
+
+
+def _run_all(scans: list[Path], options: argparse.Namespace, recipe: Recipe) -> int:
     """Every scan into a folder of its own, going on after a failure, and a table of all."""
     parent = Path(options.output or "fits")
-    rows = []
+    rows, table = [], io.StringIO()
     for number, scan in enumerate(scans, 1):
         print(f"\n[{number}/{len(scans)}] {scan}")
-        rows.append(_run(scan, parent / _unique_name(scan, scans), options))
-    parent.mkdir(parents=True, exist_ok=True)
-    table = io.StringIO()
-    writer = csv.DictWriter(table, _SUMMARY, restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    with replacing(parent / "summary.csv") as path:
-        path.write_text(table.getvalue(), encoding="utf-8")
+        rows.append(_run(scan, parent / _unique_name(scan, scans), options, recipe))
+        parent.mkdir(parents=True, exist_ok=True)
+        table = io.StringIO()
+        writer = csv.DictWriter(table, _SUMMARY, restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        with replacing(parent / "summary.csv") as path:  # after every scan: the run may be stopped
+            path.write_text(table.getvalue(), encoding="utf-8")
     print(f"\n{table.getvalue()}\nwrote    {parent / 'summary.csv'}")
     failed = [row["scan"] for row in rows if row["status"]]
     if failed:
@@ -92,34 +118,30 @@ def _run_all(scans: list[Path], options: argparse.Namespace) -> int:
     return max(row["status"] for row in rows)
 
 
-def _run(scan: Path | None, folder: Path, options: argparse.Namespace) -> dict:
+def _run(scan: Path | None, folder: Path, options: argparse.Namespace, recipe: Recipe) -> dict:
     """One fit: its row of the summary, whose status is 0, 1 for one that did not converge, 2 for one that failed."""
     name = scan.name if scan else options.example
     began = time.perf_counter()
     try:
         job = _inputs(scan, options)
         print(f"scan     {job.scan.n_points:,} points, {_size(np.asarray(job.scan.points))}")
+        done = _done(folder, job.scan, recipe) if options.resume else None
+        if done is not None:
+            print(f"done     before, in {folder}")
+            return _row(name, done, misfit(done), None)
         if job.mesh is not None:
             print(
                 f"control  {len(job.mesh.vertices):,} vertices, {job.mesh.n_faces:,} faces, {_size(job.mesh.vertices)}"
             )
-        scheme = SCHEMES[options.scheme](**({} if options.h is None else {"h": options.h}))
-        with _Progress(options.max_sweeps) as progress:
-            found = fit_scan(
+        with _Progress(recipe.max_sweeps) as progress:
+            found = recipe.fit_scan(
                 job.scan,
                 job.mesh,
-                scheme=scheme,
-                levels=options.levels,
-                faces=options.faces,
-                kind=options.kind,
-                closed=options.closed,
-                pose=None if options.align == "none" else options.align,
                 landmarks=job.landmarks,
-                tolerance_mm=options.tolerance,
                 on_stage=progress.stage,
-                max_sweeps=options.max_sweeps,
                 throw=False,
                 on_sweep=progress.update,
+                checkpoint=folder,
             )
         seconds = time.perf_counter() - began
         report, off = found.result.report(uncertainty=True), misfit(found.result)
@@ -128,10 +150,15 @@ def _run(scan: Path | None, folder: Path, options: argparse.Namespace) -> dict:
     except (js.MeshError, ValueError, TypeError, OSError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return {"scan": name, "status": 2, "seconds": f"{time.perf_counter() - began:.1f}"}
+    return _row(name, found.result, off, seconds)
+
+
+def _row(name: str, result: FitResult, off: float, seconds: float | None) -> dict:
+    report = result.report()
     return {
         "scan": name,
-        "status": 0 if found.result.result == optx.RESULTS.successful else 1,
-        "seconds": f"{seconds:.1f}",
+        "status": 0 if report.converged else 1,
+        "seconds": "" if seconds is None else f"{seconds:.1f}",
         "points": report.n_points,
         "rms_mm": f"{report.rms:.4f}",
         "percentile_95_mm": f"{report.percentile_95:.4f}",
@@ -139,6 +166,29 @@ def _run(scan: Path | None, folder: Path, options: argparse.Namespace) -> dict:
         "misfit_mm": f"{off:.4f}",
         "inlier_share": f"{report.inlier_share:.4f}",
     }
+
+
+def _done(folder: Path, scan: Scan, recipe: Recipe) -> FitResult | None:
+    """The fit in a folder that would come out again; None where there is none, or one that was stopped.
+
+    Raises:
+        ValueError: there is one of other points or with other settings.
+    """
+    unfinished = any((folder / name).exists() for name in (CHECKPOINT, CHECKPOINT_START))
+    if unfinished or not (folder / "fit.npz").exists():
+        return None
+    done = load(folder)
+    assert done.recipe is not None
+    then, now = (json.loads(one.to_json()) for one in (done.recipe, recipe))
+    others = [name for name in now if then[name] != now[name]]
+    if not np.array_equal(done.scan.points, scan.points):
+        others.append("points of the scan")
+    if others:
+        raise ValueError(
+            f"{folder} holds a fit with another {', another '.join(others)}. Without --resume it is fitted anew and "
+            "replaced; or give another folder with -o."
+        )
+    return done
 
 
 def _inputs(scan: Path | None, options: argparse.Namespace) -> _Job:
@@ -233,7 +283,7 @@ class _Progress:
             print(f"sweep {sweep.number:3d}  RMS {sweep.rms:.3f} mm")
         else:
             self._bar.set_postfix_str(f"RMS {sweep.rms:.3f} mm")
-            self._bar.update()
+            self._bar.update(sweep.number - self._bar.n)  # a fit that goes on does not begin at 1
 
 
 def _scan_files(given: list[Path]) -> list[Path]:
@@ -277,27 +327,30 @@ def _parser() -> argparse.ArgumentParser:
         epilog="OUT gets control.obj (fitted control mesh with normals), surface.ply (refined surface, with the signed "
         "distance of the scan and the standard deviation of the surface in mm at every vertex), report.json, fit.html "
         "(a page to turn the surface in, without a network), fit.png, and fit.npz and recipe.json for `fitting.load`; "
-        "of several scans, a folder each and summary.csv. Lengths are in mm. Exit status: 0 converged, 1 not "
-        "converged (files are written all the same), 2 an input cannot be used.",
+        "of several scans, a folder each and summary.csv. Lengths are in mm. A fit that was stopped, by Ctrl-C or "
+        "otherwise, goes on from the last sweep when the same command is given again. Exit status: 0 converged, 1 not "
+        "converged (files are written all the same), 2 an input cannot be used, 130 stopped by Ctrl-C.",
     )
     add = parser.add_argument
     add("scans", nargs="*", metavar="SCAN", help="points or meshes, or folders of them: .ply .xyz .csv .txt .npz .vtp")
     add("--control", metavar="MESH", help="template of triangles and quads to start from; default: made from the scan")
     add("-o", "--output", metavar="OUT", help="folder for the results (default: fit_ and the scan's name, or fits)")
-    add("--faces", type=int, default=500, help="of the control mesh, where it is made (default: 500)")
-    add("--kind", choices=("triangle", "quad"), default="triangle", help="of these faces (default: triangle)")
+    add("--faces", type=int, help=f"of the control mesh, where it is made (default: {Recipe.faces})")
+    add("--kind", choices=("triangle", "quad"), help=f"of these faces (default: {Recipe.kind})")
     add("--closed", action=argparse.BooleanOptionalAction, help="whether the anatomy is; default: found from the scan")
-    add("--align", choices=("similarity", "rigid", "affine", "none"), default="similarity", help="of the template")
+    add("--align", choices=("similarity", "rigid", "affine", "none"), help=f"of the template (default: {Recipe.pose})")
     add("--landmarks", metavar="FILE", help="named places on the scan, .json or .csv; the template's in the next")
     add("--control-landmarks", metavar="FILE", help="the same names on the template")
     add("--tolerance", type=float, metavar="MM", help="split the control mesh until the surface is this near the scan")
     add("--label", help="only the rows of a .csv whose column `label` or `contour` holds this")
     add("--scale", type=float, default=1.0, help="multiplies the scan's coordinates; 1000 for metres")
     add("--control-scale", type=float, default=1.0, help="multiplies the control mesh's coordinates")
-    add("--levels", type=int, default=3, help="levels of refinement, 1 to 8 (default: 3)")
-    add("--scheme", choices=tuple(SCHEMES), default="interpolating", help="default: interpolating")
+    add("--levels", type=int, help=f"levels of refinement, 1 to 8 (default: {Recipe.levels})")
+    add("--scheme", choices=tuple(SCHEMES), help="default: interpolating")
     add("--h", type=float, help="tangent length coefficient at the start, for schemes that have one (default: 1)")
-    add("--max-sweeps", type=int, default=60, help="pairing and solving in turns (default: 60)")
+    add("--max-sweeps", type=int, help=f"pairing and solving in turns (default: {Recipe.max_sweeps})")
+    add("--recipe", metavar="FILE", help="recipe.json of a fit: its settings; files, --scale and --label are not in it")
+    add("--resume", action="store_true", help="skip the scans that OUT has with the same points and settings")
     add("--example", choices=get_args(Example), default="head_fragment", help="which, without SCAN")
     return parser
 

@@ -498,11 +498,12 @@ def _finish(
         warnings.warn(f"alignment: {doubt}", stacklevel=3)
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = pose.linear, pose.shift
-    return Alignment(transform, _moved(mesh, pose), rms, share, tuple(doubts))
+    return Alignment(transform, put(mesh, transform), rms, share, tuple(doubts))
 
 
-def _moved(mesh: js.ControlMesh, pose: _Pose) -> js.ControlMesh:
-    normals = mesh.normals
+def put(mesh: js.ControlMesh, transform: Float[np.ndarray, "4 4"]) -> js.ControlMesh:
+    """The mesh where an alignment puts it."""
+    pose, normals = _Pose(transform[:3, :3], transform[:3, 3]), mesh.normals
     if normals is not None:
         normals = normals @ np.linalg.inv(pose.linear)
         length = np.linalg.norm(normals, axis=1, keepdims=True)

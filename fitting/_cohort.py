@@ -5,10 +5,9 @@ of one program for all: the strength of the bend prior is given, or found once b
 equations are solved by conjugate gradients, without a matrix, not further than a sweep deserves.
 """
 
-import dataclasses
 import warnings
 from collections.abc import Sequence
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,12 +20,13 @@ from jaxtyping import Array, Bool, Float, Int
 import jaxsubdiv as js
 from jaxsubdiv._errors import name_rows
 
+from ._cohort_record import Cohort
 from ._conjugate_gradients import ConjugateGradients
 from ._correspondence import boundary_vertices
 from ._elements import flat, to_unknowns
 from ._fit import AT_REST, LEAST_NOISE, check, fit, given_normals, surface_moved
 from ._free import Free, Unknowns, apply_offset, edge_length, no_offset
-from ._look import Look, Surroundings, look, measure, surroundings
+from ._look import Look, Surroundings, measure, surroundings
 from ._problem import FASTEST, HOLD, LEAST_LEFT, LET_GO, SOFTER, STEP, Found, Problem, moved_to
 from ._recipe import Recipe
 from ._residuals import Priors, Start, bend_asymmetry, bend_edges, control_edges, residuals
@@ -89,75 +89,6 @@ class _State(NamedTuple):
     robust_rms: Float[Array, "sweeps"]
     converged: Bool[Array, ""]
     finite: Bool[Array, ""]
-
-
-@final
-@dataclasses.dataclass(frozen=True)
-class Cohort:
-    """Many scans fitted with one control mesh: row `i` of every array belongs to scan `i`, and vertices correspond.
-
-    Attributes:
-        control: control vertices (mm) and unit normals `[s, v, 3]`.
-        h: the fitted tangent length coefficients, one row a scan; None where the scheme has none.
-        surfaces: vertices and normals `[s, w, 3]` of the refined surfaces; the faces are those of all.
-        converged: which fits came to rest. The others are what there was when the sweeps ran out or went astray.
-        sweeps: how many each took.
-        rms, robust_rms: as in `FitResult`, at the start and after every sweep; NaN beyond the last.
-        noise: standard deviation of the Gaussian part of each scan's distances, in mm.
-        weights: how much each point counts at the end, `[s, p]`; 0 past a scan's last point.
-        scans: what was fitted.
-    """
-
-    control: js.Control
-    h: Float[Array, "s ..."] | None
-    surfaces: js.RefinedSurface
-    converged: Bool[np.ndarray, "s"]
-    sweeps: Int[np.ndarray, "s"]
-    rms: Float[np.ndarray, "s sweeps"]
-    robust_rms: Float[np.ndarray, "s sweeps"]
-    noise: Float[np.ndarray, "s"]
-    weights: Float[np.ndarray, "s p"]
-    scans: tuple[Scan, ...]
-    _recipe: Recipe
-    _problem: Problem
-    _starts: js.Control
-    _finite: Bool[np.ndarray, "s"]
-
-    def __len__(self) -> int:
-        return len(self.scans)
-
-    def result(self, i: int) -> FitResult:
-        """The fit of scan `i` as `fit` gives it, with report, uncertainty and `save`; made when it is asked for."""
-        recipe, topology, scan = self._recipe, self._problem.topology, self.scans[i]
-        control, start, surface = (
-            js.Control(part.vertices[i], part.normals[i]) for part in (self.control, self._starts, self.surfaces)
-        )
-        surface = js.RefinedSurface(surface.vertices, surface.normals, topology.faces)
-        scheme = recipe.scheme if self.h is None else eqx.tree_at(lambda s: s.h, recipe.scheme, self.h[i])
-        edge = float(edge_length(topology, control.vertices))
-        open_vertices = boundary_vertices(surface)
-        seen = look(surface, scan, open_vertices, surroundings(scan), edge, recipe.loss, LEAST_NOISE * edge)
-        problem = Problem(recipe.scheme, topology, start, recipe.free, recipe.priors)
-        problem.tell(self._problem.found()._replace(template=np.asarray(start.vertices, np.float64)))
-        counted, ends = slice(None, int(self.sweeps[i]) + 1), optx.RESULTS
-        stopped = ends.nonlinear_max_steps_reached if self._finite[i] else ends.nonfinite
-        return FitResult(
-            control=control,
-            scheme=scheme,
-            surface=surface,
-            scan=scan,
-            at=seen.at,
-            distances=np.asarray(seen.distances),
-            weights=np.asarray(seen.weights),
-            rms=self.rms[i][counted],
-            robust_rms=self.robust_rms[i][counted],
-            noise=float(seen.noise),
-            result=ends.successful if self.converged[i] else stopped,
-            problem=problem,
-            seen=seen,
-            recipe=recipe,
-            start=start,
-        )
 
 
 def fit_cohort(

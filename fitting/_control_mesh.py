@@ -25,6 +25,7 @@ FaceKind: TypeAlias = Literal["triangle", "quad"]
 
 _LEAST_POINTS = 50
 _LEAST_FACES = 16
+_SIZES = (1.0, 5000.0)  # mm: what is smaller or larger is hardly anatomy, but in another unit
 _AT_MOST = 40_000  # points that are looked at: more change no coarse mesh
 _CELLS = 160  # along the longest side: a cortex needs them, or its folds grow together
 _NEIGHBOUR = 10  # the one whose distance tells the density
@@ -82,7 +83,8 @@ def control_mesh(
             closed surface lies far from all points.
 
     Warns:
-        UserWarning: other parts of the scan were left out; the text gives their shares.
+        UserWarning: other parts of the scan were left out; the text gives their shares. Or the scan is so small or
+            large that its unit is hardly mm.
 
     Raises:
         ScanError: fewer than 50 points, all on a line or a plane, or no surface in them; faces too few for the
@@ -97,6 +99,7 @@ def control_mesh(
         raise ValueError(f"`faces` must be {_LEAST_FACES} or more; got {faces}.")
     _need_extra()
     cloud = _cleaned(scan)
+    _warn_of_unit(float(np.linalg.norm(np.ptp(cloud.points, axis=0))))
     cloud, dense, topology = _simplest(cloud if scan.normals is None else _outwards(cloud), closed)
     coarse = coarsen(dense, faces if kind == "triangle" else 2 * faces, topology)
     if coarse is None:
@@ -214,6 +217,8 @@ def _agreement(settled: tuple[_Cloud, Implicit]) -> float:
 
 
 def _check_extent(points: Float[np.ndarray, "p 3"]) -> None:
+    if len(points) == 1:
+        raise ScanError(f"all points lie on one spot, {np.round(points[0], 3).tolist()}: no surface follows.")
     if len(points) < _LEAST_POINTS:
         raise ScanError(
             f"{len(points)} points of different places are too few to make a control mesh of; {_LEAST_POINTS} are the "
@@ -223,6 +228,15 @@ def _check_extent(points: Float[np.ndarray, "p 3"]) -> None:
     if width[2] <= 1e-6 * width[0]:
         where = "a line" if width[1] <= 1e-6 * width[0] else "a plane"
         raise ScanError(f"all points lie on {where}: no surface follows. Was a coordinate lost when they were written?")
+
+
+def _warn_of_unit(size: float) -> None:
+    if not _SIZES[0] <= size <= _SIZES[1]:
+        warnings.warn(
+            f"the scan measures {size:.3g} across, which is taken as mm. If it is in another unit, read it with "
+            "`scale=`: 1000 for metres, 0.001 for micrometres.",
+            stacklevel=3,
+        )
 
 
 def _settled(cloud: _Cloud, cell: float, smoother: float = 1.0) -> tuple[_Cloud, Implicit]:

@@ -1,7 +1,9 @@
 """`fit`: pairing on the host, derivatives on the device and a sparse solution on the host, in turns."""
 
+import os
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
@@ -15,11 +17,12 @@ import jaxsubdiv as js
 from jaxsubdiv._linalg import dot, unit
 from jaxsubdiv._surface import corner_weights
 
+from ._checkpoint import Checkpoint
 from ._correspondence import boundary_vertices, closest_points
 from ._free import Free, apply_offset, edge_length
 from ._landmarks import Landmarks, place_landmarks
 from ._look import Look, look, surroundings
-from ._problem import Problem
+from ._problem import Memory, Problem
 from ._recipe import Recipe
 from ._residuals import Anchors, Priors
 from ._result import FitResult
@@ -36,6 +39,7 @@ LEAST_NOISE = 1e-4
 AT_REST = 0.01
 _LEAST_MARGIN = 0.05  # of a control normal at the start; see `js.admissible_margin`
 _MOST = 0.9  # of the surface: so much of it has to be at rest
+CHECKPOINT = "checkpoint.npz"
 
 
 class Sweep(NamedTuple):
@@ -63,6 +67,7 @@ def fit(
     tolerance: float = 0.1,
     throw: bool = True,
     on_sweep: Callable[[Sweep], None] | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
 ) -> FitResult:
     """Fit a control mesh, its normals and h to a scan, so that the refined surface passes through the points.
 
@@ -88,11 +93,14 @@ def fit(
             hundredth of a control edge, where that is more.
         throw: raise where the fit did not converge, or return the reason in `FitResult.result`.
         on_sweep: called after every sweep, for progress.
+        checkpoint: a folder that keeps the state after every sweep in `checkpoint.npz`. Called again with the same
+            arguments, a fit that was stopped goes on from there, to the same result bit for bit. The file goes when
+            the fit has ended.
 
     Raises:
         UserWarning: the start is so far off that the fit will hardly find its way.
         ScanError: the sizes of scan and control mesh differ as by a wrong unit, or there are too few points.
-        ValueError: the topology has no levels, or does not fit the control.
+        ValueError: the topology has no levels, or does not fit the control; the checkpoint is of another fit.
         RuntimeError: with `throw`, the fit did not converge or met values that are not finite.
     """
     check(scheme, topology, control, scan)
@@ -100,7 +108,11 @@ def fit(
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
     control = js.Control(control.vertices, given_normals(topology, control))
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
+    settings["landmark_deviation"] = landmark_deviation
     recipe = Recipe.of(scheme, topology, **settings)
+    given = {"scheme": scheme, "topology": topology, "control": control, "scan": scan, "landmarks": landmarks}
+    kept = None if checkpoint is None else Checkpoint(Path(checkpoint) / CHECKPOINT, given | settings)
+    before = None if kept is None else kept.read()
     start = control
     surface = js.refine(scheme, topology, control)
     open_vertices, edge = boundary_vertices(surface), float(edge_length(topology, control.vertices))
@@ -111,7 +123,11 @@ def fit(
     rms, robust_rms, result = [float(seen.rms)], [float(seen.robust_rms)], optx.RESULTS.nonlinear_max_steps_reached
     anchors = None if landmarks is None else _anchors(landmarks, landmark_deviation, topology, control, surface)
     problem = Problem(scheme, topology, control, free, priors, anchors)
-    for sweep in range(max_sweeps):
+    if before is not None:
+        scheme, control, rms, robust_rms = _recalled(before, problem, scheme, control, seen)
+        surface = js.refine(scheme, topology, control)
+        seen = look(surface, scan, open_vertices, around, edge, loss, _floor(widest, len(rms) - 1, edge))
+    for sweep in range(len(rms) - 1, max_sweeps):
         proposed = _apply(topology, scheme, control, problem.step(scheme, control, seen))
         refined = js.refine(proposed[0], topology, proposed[1])
         if not np.isfinite(refined.vertices).all():
@@ -119,7 +135,7 @@ def fit(
             break
         moved = float(surface_moved(surface, refined))
         (scheme, control), surface = proposed, refined
-        floor = max(widest * 0.5 ** (sweep + 1), LEAST_NOISE * edge)
+        floor = _floor(widest, sweep + 1, edge)
         seen = look(surface, scan, open_vertices, around, edge, loss, floor)
         rms.append(float(seen.rms))
         robust_rms.append(float(seen.robust_rms))
@@ -130,6 +146,11 @@ def fit(
         if annealed and max(moved, abs(robust_rms[-1] - robust_rms[-2])) <= at_rest:
             result = optx.RESULTS.successful
             break
+        if kept is not None:
+            now = {"vertices": control.vertices, "normals": control.normals, "h": scheme.h}
+            kept.write(now | {"rms": rms, "robust_rms": robust_rms} | problem.memory()._asdict())
+    if kept is not None:
+        kept.remove()
     found = FitResult(
         control=control,
         scheme=scheme,
@@ -156,6 +177,24 @@ def fit(
 
 
 _apply = eqx.filter_jit(apply_offset)
+
+
+def _floor(widest: float, sweep: int, edge: float) -> float:
+    """Least scale of the loss after a sweep: half of what it was after the one before."""
+    return max(widest * 0.5**sweep, LEAST_NOISE * edge)
+
+
+def _recalled(
+    before: dict[str, np.ndarray], problem: Problem, scheme: js.AbstractScheme, control: js.Control, seen: Look
+) -> tuple[js.AbstractScheme, js.Control, list[float], list[float]]:
+    """Scheme, control and RMS distances of a fit that was stopped; its problem takes up what it knew."""
+    memory = Memory._make(before[name] for name in Memory._fields)
+    memory = memory._replace(determined=float(memory.determined), annealed=bool(memory.annealed))
+    problem.recall(memory, scheme, control, seen)
+    if scheme.h is not None:
+        scheme = eqx.tree_at(lambda s: s.h, scheme, jnp.asarray(before["h"]))
+    control = js.Control(jnp.asarray(before["vertices"]), jnp.asarray(before["normals"]))
+    return scheme, control, before["rms"].tolist(), before["robust_rms"].tolist()
 
 
 @eqx.filter_jit

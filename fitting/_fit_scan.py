@@ -1,20 +1,26 @@
 """From a scan alone, or with a template, to a fit: align or make the control mesh, fit, split where it is coarse."""
 
 import dataclasses
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
 import jaxsubdiv as js
 
-from ._align import Alignment, align
-from ._control_mesh import control_mesh
+from ._align import Alignment, Kind, align, put
+from ._checkpoint import Checkpoint
+from ._control_mesh import FaceKind, control_mesh
 from ._correspondence import nearest_rows
-from ._fit import fit
+from ._fit import check, fit
 from ._landmarks import Landmarks
+from ._recipe import Recipe
 from ._result import FitResult
 from ._scan import Scan
 
@@ -23,6 +29,7 @@ Outcome: TypeAlias = Literal["tolerance met", "noise reached", "no more faces"]
 # Misfit that is a smaller part of the noise than this does not show beside it.
 _LEAST_MISFIT = 0.15
 _SWELLINGS = 3
+CHECKPOINT_START = "checkpoint_start.npz"
 
 
 class ScanFit(NamedTuple):
@@ -39,20 +46,30 @@ class ScanFit(NamedTuple):
     """Why no further split was made; None where no tolerance was asked for."""
 
 
+class _Start(NamedTuple):
+    """Where a fit starts."""
+
+    mesh: js.ControlMesh
+    scheme: js.AbstractScheme
+    alignment: Alignment | None
+    splits: int
+
+
 def fit_scan(
     scan: Scan,
     mesh: js.ControlMesh | None = None,
     *,
     scheme: js.AbstractScheme | None = None,
-    levels: int = 2,
-    faces: int = 500,
-    kind: Literal["triangle", "quad"] = "triangle",
-    closed: bool | None = None,
-    pose: Literal["rigid", "similarity", "affine"] | None = "similarity",
+    levels: int = Recipe.levels,
+    faces: int = Recipe.faces,
+    kind: FaceKind = Recipe.kind,
+    closed: bool | None = Recipe.closed,
+    pose: Kind | None = Recipe.pose,
     landmarks: Landmarks | None = None,
-    tolerance_mm: float | None = None,
-    most_faces: int = 10_000,
+    tolerance_mm: float | None = Recipe.tolerance_mm,
+    most_faces: int = Recipe.most_faces,
     on_stage: Callable[[str], None] | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
     **options: Any,
 ) -> ScanFit:
     """Fit a scan from end to end.
@@ -61,7 +78,7 @@ def fit_scan(
         scan: in mm.
         mesh: the template; default: a control mesh is made from the scan, see `control_mesh`.
         scheme: default: `js.Interpolating()`.
-        levels: of refinement.
+        levels: of refinement, see `Recipe`.
         faces, kind, closed: of the control mesh, where it is made; see `control_mesh`.
         pose: how the template may move to the scan before the fit, see `align`; None leaves it where it is.
         landmarks: places on scan and template, for the alignment and the fit; see `Landmarks`.
@@ -70,38 +87,88 @@ def fit_scan(
             `most_faces` or for two points a control vertex.
         most_faces: of the control mesh, where it is split.
         on_stage: told what begins, in a few words.
-        options: of `fit`.
+        checkpoint: a folder from which a call with the same arguments goes on where it was stopped, see `fit`; where
+            the fit started is in it too, in `checkpoint_start.npz`.
+        options: of `fit`; or `mesh_normals` and `limit`, of `js.build_topology`.
 
     Raises:
         ScanError, ValueError, ImportError, RuntimeError: as `align`, `control_mesh` and `fit` do.
     """
     say = on_stage or (lambda words: None)
-    scheme, alignment = scheme or js.Interpolating(), None
-    if mesh is None:
+    first = scheme or js.Interpolating()
+    of_tables = {name: options.pop(name) for name in ("mesh_normals", "limit") if name in options}
+    settings = {"faces": faces, "kind": kind, "closed": closed, "pose": pose}
+    settings |= {"tolerance_mm": tolerance_mm, "most_faces": most_faces}
+    kept = before = None
+    if checkpoint is not None:
+        template = None if mesh is None else (mesh.vertices, mesh.faces, mesh.normals)
+        inputs = {"scan": scan, "mesh": template, "scheme": first, "levels": levels, "landmarks": landmarks}
+        inputs |= {name: value for name, value in options.items() if name not in ("throw", "on_sweep")}
+        kept = Checkpoint(Path(checkpoint) / CHECKPOINT_START, inputs | settings | of_tables)
+        before = kept.read()
+    if before is not None:
+        say("goes on where it was stopped")
+        start = _recalled(before, first, mesh)
+    elif mesh is None:
         say(f"makes a control mesh of about {faces} faces")
-        mesh = control_mesh(scan, faces=faces, kind=kind, closed=closed)
-        if scheme.takes == (3,):
-            mesh = mesh.triangulated()
+        made = control_mesh(scan, faces=faces, kind=kind, closed=closed)
+        start = _Start(made.triangulated() if first.takes == (3,) else made, first, None, 0)
     elif pose is not None:
         say("aligns the control mesh with the scan")
         alignment = align(mesh, scan, kind=pose, landmarks=landmarks)
-        landmarks = None if landmarks is None else moved(landmarks, mesh, alignment)
-        mesh = alignment.mesh
-    splits = 0
+        start = _Start(alignment.mesh, first, alignment, 0)
+    else:
+        start = _Start(mesh, first, None, 0)
     while True:
-        say(f"fits {len(mesh.vertices):,} control vertices")
+        say(f"fits {len(start.mesh.vertices):,} control vertices")
         # Tables come from the faces alone; normals that would fold the surface are replaced in the fit.
-        topology = js.build_topology(js.ControlMesh(mesh.vertices, mesh.faces), scheme, levels)
-        control = mesh.control(weights=scheme.weights)
-        if splits == 0 and not scheme.interpolates:
-            control = js.Control(_swollen(mesh, scheme), control.normals)
-        result = fit(scheme, topology, control, scan, landmarks=landmarks, **options)
-        outcome = _outcome(result, mesh, tolerance_mm, most_faces)
+        bare = js.ControlMesh(start.mesh.vertices, start.mesh.faces)
+        topology = js.build_topology(bare, start.scheme, levels, **of_tables)
+        control = start.mesh.control(weights=first.weights)
+        if start.splits == 0 and not first.interpolates:
+            control = js.Control(_swollen(start.mesh, first), control.normals)
+        if kept is not None:
+            check(start.scheme, topology, control, scan)  # what cannot be fitted leaves no file
+            kept.write(_arrays(start))
+        # The landmarks' places were those of the template.
+        of_first = _landmarks_there(landmarks, mesh, start) if start.splits == 0 else None
+        result = fit(start.scheme, topology, control, scan, landmarks=of_first, checkpoint=checkpoint, **options)
+        outcome = _outcome(result, start.mesh, tolerance_mm, most_faces)
         if tolerance_mm is None or outcome is not None:
-            return ScanFit(result, mesh, alignment, splits, outcome)
-        scheme, splits = result.scheme, splits + 1
-        landmarks = None  # their places were those of the template
-        mesh = _split(result, mesh)
+            break
+        start = _Start(_split(result, start.mesh), result.scheme, start.alignment, start.splits + 1)
+    if kept is not None:
+        kept.remove()
+    assert result.recipe is not None
+    result.recipe = dataclasses.replace(result.recipe, scheme=first, **settings)
+    return ScanFit(result, start.mesh, start.alignment, start.splits, outcome)
+
+
+def _landmarks_there(landmarks: Landmarks | None, mesh: js.ControlMesh | None, start: _Start) -> Landmarks | None:
+    if landmarks is None or mesh is None or start.alignment is None:
+        return landmarks
+    return moved(landmarks, mesh, start.alignment)
+
+
+def _arrays(start: _Start) -> dict[str, Any]:
+    """A start as a checkpoint keeps it; the mesh of the alignment follows from the rest."""
+    mesh, alignment = start.mesh, start.alignment
+    arrays = {"vertices": mesh.vertices, "triangles": mesh.faces[3], "quads": mesh.faces[4], "normals": mesh.normals}
+    arrays |= {"h": start.scheme.h, "splits": start.splits}
+    return arrays if alignment is None else arrays | alignment._replace(mesh=None)._asdict()
+
+
+def _recalled(arrays: dict[str, np.ndarray], scheme: js.AbstractScheme, template: js.ControlMesh | None) -> _Start:
+    mesh = js.ControlMesh(
+        arrays["vertices"], {3: arrays["triangles"], 4: arrays["quads"]}, arrays.get("normals"), check=False
+    )
+    if scheme.h is not None:
+        scheme = eqx.tree_at(lambda s: s.h, scheme, jnp.asarray(arrays["h"]))
+    alignment = None
+    if template is not None and "transform" in arrays:
+        numbers = float(arrays["rms"]), float(arrays["share"]), tuple(map(str, arrays["doubts"]))
+        alignment = Alignment(arrays["transform"], put(template, arrays["transform"]), *numbers)
+    return _Start(mesh, scheme, alignment, int(arrays["splits"]))
 
 
 def misfit(result: FitResult) -> float:

@@ -77,6 +77,16 @@ class Found(NamedTuple):
     anchors: Anchors | None
 
 
+class Memory(NamedTuple):
+    """What a problem knows after a sweep, and needs for the next."""
+
+    bend_precision: Float[np.ndarray, "f"]
+    determined: float
+    annealed: bool
+    hold: Float[np.ndarray, "n"]
+    last_step: Float[np.ndarray, "n"]
+
+
 class Problem:
     """What stays the same from sweep to sweep; and the strength of the bend prior, which the sweeps find."""
 
@@ -281,6 +291,15 @@ class Problem:
     def tell(self, found: Found) -> None:
         """Take over what the sweeps of another problem found."""
         self._precision, self.determined, self.annealed = found.bend_precision, found.determined, found.annealed
+
+    def memory(self) -> Memory:
+        """What `recall` needs, to go on from here."""
+        return Memory(self._precision, self.determined, self.annealed, self._hold, self._last_step)
+
+    def recall(self, memory: Memory, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> None:
+        """Go on where another problem was, that made its first step from this scheme and control."""
+        self._elements = self._analyse(self.start(scheme, control), seen, self._owner[np.asarray(seen.at.face)])
+        self._precision, self.determined, self.annealed, self._hold, self._last_step = memory
 
     def _matrix(self, values: np.ndarray, diagonal: np.ndarray) -> sp.csc_array:
         pattern = self.elements.pattern

@@ -1,6 +1,7 @@
 """Both command lines, run in this process: what they write and print, and what they refuse."""
 
 import csv
+import functools
 import json
 import subprocess
 import sys
@@ -246,7 +247,7 @@ def test_options_of_a_fit_reach_it(files, monkeypatch, options, scheme, levels, 
         seen.append((scheme, levels, max_sweeps))
         raise ValueError("seen enough")
 
-    monkeypatch.setattr("fitting.__main__.fit_scan", told)
+    monkeypatch.setattr("fitting._fit_scan.fit_scan", told)
     assert run(fit, "scan.xyz", "--control", "control.obj", *options.split()) == 2
     [(found, *numbers)] = seen
     assert type(found) is type(scheme) and found.h == scheme.h and numbers == [levels, max_sweeps]
@@ -271,7 +272,7 @@ def test_options_of_a_start_reach_it(files, monkeypatch, options, expected):
         seen.append(how)
         raise ValueError("seen enough")
 
-    monkeypatch.setattr("fitting.__main__.fit_scan", told)
+    monkeypatch.setattr("fitting._fit_scan.fit_scan", told)
     assert run(fit, "scan.xyz", "--control", "control.obj", *options.split()) == 2
     assert {name: seen[0][name] for name in expected} == expected
 
@@ -331,6 +332,91 @@ def test_landmarks_of_both_sides_are_kept_together(files, capsys):
     assert "landmarks are places on both sides" in capsys.readouterr().err
 
 
+def test_recipe_of_a_fit_has_the_settings_and_options_come_before_it(files, monkeypatch):
+    first = ("--levels", 1, "--h", 1.1, "--max-sweeps", 1, "--align", "none", "--closed", "--faces", 77)
+    assert run(fit, "scan.xyz", "--control", "control.obj", *first, "-o", "first") == 1
+    np.savetxt("next.xyz", problem().points + noise(1), fmt="%.17g")
+    again = ("--control", "control.obj", "--recipe", "first/recipe.json")
+    assert run(fit, "next.xyz", *again, "-o", "recipe") == 1
+    assert run(fit, "next.xyz", "--control", "control.obj", *first, "-o", "options") == 1
+    for name in ("control.obj", "recipe.json"):
+        assert Path("recipe", name).read_text() == Path("options", name).read_text()
+    seen = []
+
+    def told(scan, mesh, **how):
+        seen.append(how)
+        raise ValueError("seen enough")
+
+    monkeypatch.setattr("fitting._fit_scan.fit_scan", told)
+    assert run(fit, "next.xyz", *again, "--levels", 2, "--align", "rigid", "--no-closed", "--scheme", "circle") == 2
+    changed = {"levels": 2, "pose": "rigid", "closed": False, "max_sweeps": 1, "faces": 77}
+    assert {name: seen[0][name] for name in changed} == changed and isinstance(seen[0]["scheme"], js.CirclePreserving)
+
+
+def stop_after(monkeypatch, sweeps: float) -> None:
+    """Ctrl-C once a fit has made so many sweeps."""
+
+    def stop(self, sweep):
+        if sweep.number > sweeps:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("fitting.__main__._Progress._update", stop)
+
+
+def test_ctrl_c_leaves_a_checkpoint_and_the_same_command_goes_on(files, capsys, monkeypatch):
+    command = ("scan.xyz", *GIVEN, "-o")
+    assert run(fit, *command, "whole") == 0
+    stop_after(monkeypatch, 2)
+    assert run(fit, *command, "out") == 130
+    captured = capsys.readouterr()
+    assert "stopped  the same command goes on from the last sweep\n" in captured.err and "Traceback" not in captured.err
+    assert names(files / "out") == ["checkpoint.npz", "checkpoint_start.npz"]
+    assert run(fit, *command, "out", "--faces", 80) == 2
+    assert "checkpoint_start.npz is of another fit, with another faces" in capsys.readouterr().err
+    stop_after(monkeypatch, np.inf)
+    assert run(fit, *command, "out") == 0
+    assert "now      goes on where it was stopped" in capsys.readouterr().out
+    assert names(files / "out") == RESULTS
+    for name in ("control.obj", "report.json", "surface.ply"):
+        assert Path("out", name).read_bytes() == Path("whole", name).read_bytes()
+
+
+def test_resume_skips_what_is_done_and_goes_on_with_the_rest(files, capsys, monkeypatch):
+    Path("scans").mkdir()
+    for i in range(3):
+        np.savetxt(f"scans/{i}.xyz", problem().points + noise(i), fmt="%.17g")
+    command = ("scans", *GIVEN, "--max-sweeps", 2, "-o", "out")
+    first = functools.partial(run, fit, *command)
+    done = []
+
+    def stop_in_second(self, sweep):
+        done.append(sweep.number)
+        if len(done) == 4:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("fitting.__main__._Progress._update", stop_in_second)
+    assert first() == 130
+    assert "with --resume it skips the scans that are done" in capsys.readouterr().err
+    assert names(files / "out") == ["0", "1", "summary.csv"] and "checkpoint.npz" in names(files / "out" / "1")
+    before = (files / "out" / "0" / "fit.npz").stat().st_mtime_ns
+    assert first("--resume") == 1
+    assert len(done) == 4 + 1 + 2  # the second from its second sweep on, and the third
+    assert "done     before, in out/0" in capsys.readouterr().out
+    assert (files / "out" / "0" / "fit.npz").stat().st_mtime_ns == before
+    rows = list(csv.DictReader((files / "out" / "summary.csv").read_text().splitlines()))
+    assert [row["scan"] for row in rows] == ["0.xyz", "1.xyz", "2.xyz"] and rows[0]["seconds"] == "" != rows[1][
+        "seconds"
+    ]
+    own = json.loads((files / "out" / "0" / "report.json").read_text())
+    np.testing.assert_allclose(float(rows[0]["rms_mm"]), own["rms"], atol=6e-5)
+    np.savetxt("scans/0.xyz", problem().points, fmt="%.17g")
+    capsys.readouterr()
+    assert first("--resume", "--max-sweeps", 3) == 2
+    err = capsys.readouterr().err
+    assert "out/0 holds a fit with another max_sweeps, another points of the scan. Without --resume" in err
+    assert "out/2 holds a fit with another max_sweeps. Without" in err
+
+
 def test_fit_that_did_not_converge_is_status_1_and_written_all_the_same(files, capsys):
     assert run(fit, "scan.xyz", *GIVEN, "--max-sweeps", 2) == 1
     assert "NOT CONVERGED" in capsys.readouterr().out
@@ -387,6 +473,15 @@ FIT_REFUSED = {
     "scan in metres": ("metres.xyz --control control.obj --levels 1 --align none", "their units differ"),
     "scan in metres, to be aligned": ("metres.xyz --control control.obj --levels 1", "m and mm"),
     "folder without scans": (".git", "holds no scan"),
+    "empty file": ("empty.xyz", "empty.xyz: the file is empty"),
+    "rows that are not finite": ("nan.xyz", "nan.xyz, line 2, 4: a number is not finite. Delete these rows."),
+    "one spot": ("spot.xyz --control control.obj", "all points of the scan lie on one spot"),
+    "one spot, not aligned": ("spot.xyz --control control.obj --align none --levels 1", "lie on one spot"),
+    "decimal commas": ("commas.xyz", "commas.xyz, line 1: '1,5' is not a number. Write decimals with a point."),
+    "control mesh without faces": ("scan.xyz --control points.obj", "points.obj: it holds points but no faces"),
+    "h of a scheme without one": ("scan.xyz --scheme loop --h 1", "the scheme Loop has no h: leave --h out."),
+    "no such recipe": ("scan.xyz --recipe none.json", "none.json"),
+    "recipe that is none": ("scan.xyz --recipe points.obj", "points.obj: no JSON text"),
     "too few points": (
         "few.xyz --control control.obj --levels 1 --align none",
         "the scan has 2 points for 12 control vertices",
@@ -399,6 +494,11 @@ def test_fit_of_what_cannot_be_used_is_status_2_with_words_and_without_files(fil
     arguments, words = FIT_REFUSED[name]
     Path("text.xyz").write_text("hello world\n")
     Path("few.xyz").write_text("1 2 3\n4 5 6\n")
+    Path("empty.xyz").touch()
+    Path("nan.xyz").write_text("1 2 3\n1 nan 3\n4 5 6\ninf 1 2\n")
+    Path("spot.xyz").write_text("1 2 3\n" * 20)
+    Path("commas.xyz").write_text("1,5 2,5 3,5\n" * 20)
+    Path("points.obj").write_text("v 1 2 3\nv 4 5 6\n")
     Path(".git").mkdir()
     assert run(fit, *arguments.split()) == 2
     err = capsys.readouterr().err

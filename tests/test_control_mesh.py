@@ -1,6 +1,7 @@
 """Control meshes made from scans: sound, even, on the scan, of the right topology."""
 
 import functools
+import re
 import sys
 
 import meshes
@@ -186,7 +187,7 @@ def test_turning_the_scan_turns_the_mesh():
 LINE = np.arange(90.0)[:, None] * (1, 2, 3)
 REFUSED = {
     "few": (ball(40), "40 points of different places are too few to make a control mesh of; 50 are the least"),
-    "spot": (np.ones((500, 3)), "1 points of different places are too few"),
+    "spot": (np.ones((500, 3)), r"all points lie on one spot, \[1.0, 1.0, 1.0\]: no surface follows"),
     "line": (LINE, "all points lie on a line: no surface follows"),
     "plane": (ball(200) * (1, 1, 0), "all points lie on a plane: no surface follows. Was a coordinate lost"),
 }
@@ -198,6 +199,16 @@ def test_refuses(case):
     points, words = REFUSED[case]
     with pytest.raises(ScanError, match=words):
         control_mesh(Scan(points))
+
+
+@needs_extra
+@pytest.mark.parametrize("scale", [0.001, 1000.0])
+def test_scan_that_is_hardly_in_mm_is_told(scale):
+    points = ball() * scale
+    size = np.linalg.norm(np.ptp(points, axis=0))
+    with pytest.warns(UserWarning, match=re.escape(f"the scan measures {size:.3g} across") + ", which is taken as mm"):
+        made = control_mesh(Scan(points), faces=60)
+    np.testing.assert_allclose(np.ptp(made.vertices, axis=0), np.ptp(points, axis=0), rtol=0.2)  # nothing is guessed
 
 
 @needs_extra

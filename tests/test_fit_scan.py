@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 import fitting
 import jaxsubdiv as js
 from fitting import Landmarks, Scan, fit_scan, misfit
-from fitting._fit_scan import _outcome
+from fitting._fit import CHECKPOINT
+from fitting._fit_scan import CHECKPOINT_START, _outcome
 
 
 def mesh_and_scan(**scan) -> tuple[js.ControlMesh, Scan]:
@@ -31,12 +32,15 @@ def test_template_is_aligned_before_it_is_fitted():
     assert there.alignment is None and there.result.rms[-1] > 20
 
 
-def test_splitting_goes_on_until_the_tolerance_is_met():
-    """A scan with ripples that twelve control vertices cannot follow."""
-    mesh, _ = mesh_and_scan()
+def rippled() -> Scan:
+    """What twelve control vertices cannot follow."""
     points = problem().points
     ripples = 0.4 * np.sin(points[:, :1] / 3) * points / np.linalg.norm(points, axis=1, keepdims=True)
-    scan = Scan(points + ripples + 0.1 * noise())
+    return Scan(points + ripples + 0.1 * noise())
+
+
+def test_splitting_goes_on_until_the_tolerance_is_met():
+    (mesh, _), scan = mesh_and_scan(), rippled()
     coarse = fit_scan(scan, mesh, levels=1, pose=None, throw=False, max_sweeps=12)
     assert coarse.outcome is None and misfit(coarse.result) > 0.1
     fine = fit_scan(scan, mesh, levels=1, pose=None, tolerance_mm=0.08, throw=False, max_sweeps=12)
@@ -44,6 +48,37 @@ def test_splitting_goes_on_until_the_tolerance_is_met():
     assert fine.start.n_faces == mesh.n_faces * 4**fine.splits
     stopped = fit_scan(scan, mesh, levels=1, pose=None, tolerance_mm=0.001, most_faces=50, throw=False, max_sweeps=12)
     assert stopped.outcome == "no more faces" and stopped.splits == 0
+
+
+def test_fit_that_was_stopped_after_a_split_goes_on_there(tmp_path):
+    """Without alignment and first fit, to the same end as one that was not stopped."""
+    mesh, _ = mesh_and_scan()
+    how = {"levels": 1, "tolerance_mm": 0.08, "max_sweeps": 6, "throw": False}
+    stages, more_stages, numbers = [], [], []
+    whole = fit_scan(rippled(), mesh, **how)
+
+    def stop(sweep: fitting.Sweep) -> None:
+        if len(stages) == 3 and sweep.number > 2:  # the alignment, a fit, and the one after the split
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_scan(rippled(), mesh, checkpoint=tmp_path, on_stage=stages.append, on_sweep=stop, **how)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [CHECKPOINT, CHECKPOINT_START]
+    tell = {"on_stage": more_stages.append, "on_sweep": lambda sweep: numbers.append(sweep.number)}
+    again = fit_scan(rippled(), mesh, checkpoint=tmp_path, **tell, **how)
+    assert more_stages[:2] == ["goes on where it was stopped", stages[2]] and numbers[0] == 3
+    assert again.splits == whole.splits >= 1 and again.outcome == whole.outcome
+    assert again.result.recipe.to_json() == whole.result.recipe.to_json()
+    assert again.alignment[2:] == whole.alignment[2:] and not list(tmp_path.iterdir())
+    for found, expected in (
+        (again.result.control.vertices, whole.result.control.vertices),
+        (again.result.rms, whole.result.rms),
+        (again.start.vertices, whole.start.vertices),
+        (again.alignment.transform, whole.alignment.transform),
+        (again.alignment.mesh.vertices, whole.alignment.mesh.vertices),
+        (again.alignment.mesh.normals, whole.alignment.mesh.normals),
+    ):
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_splitting_stops_at_the_noise():

@@ -706,6 +706,9 @@ def test_damage_raises_nothing_else(data):
         ("1,2,3\n1,b,3\n", "line 2: 'b' is not a number. Write decimals with a point"),
         ("1;2;3\n1;2,5;3\n", "line 2: '2,5' is not a number. Write decimals with a point"),
         ("x,y,z\n1,,3\n", "line 2: '' is not a number"),
+        ("x,y,z\n1,5,2,5,3,5\n", "line 2: 6 columns, where the first row has 3. Write decimals with a point"),
+        ("1,5 -2,25 3\n1,5 2,5 3\n", "line 1: '1,5' is not a number. Write decimals with a point"),
+        ("1,257,-29,868,12,079\n2,257,-29,868,12,079\n", "6 columns of whole numbers, .*: decimal commas, it seems"),
         ("1 2 3\n1 2 3_0\n", "line 2: '3_0' is not a number"),
         ("1,2,3\n1,2,3" + 200000 * "3" + ",4\n", "line 2: 1 columns, where the first row has 3"),
         ("1 2 3\n1 2 \uff13\n", "the numbers cannot be read. Write them in plain digits"),
@@ -715,6 +718,11 @@ def test_damage_raises_nothing_else(data):
 def test_point_tables_that_cannot_be_read(tmp_path, content, words):
     with pytest.raises(MeshError, match=words):
         read_points(put(tmp_path, "a.csv", content))
+
+
+def test_whole_numbers_in_named_columns_are_what_the_names_say(tmp_path):
+    cloud = read_points(put(tmp_path, "a.csv", "x,y,z,nx,ny,nz\n1,257,-29,868,12,79\n"))
+    np.testing.assert_array_equal(cloud.normals, [(868, 12, 79)])
 
 
 def test_not_finite_points_are_named_by_row(tmp_path):

@@ -1,5 +1,6 @@
 """Fits as folders and settings as recipes: what comes back is what was saved, or an error says why not."""
 
+import dataclasses
 import functools
 import json
 import shutil
@@ -198,11 +199,21 @@ def test_recipe_of_every_loss_and_option_comes_back_from_json(loss):
         loss,
         max_sweeps=7,
         tolerance=0.03,
+        landmark_deviation=0.2,
+        faces=80,
+        kind="quad",
+        closed=False,
+        pose=None,
+        tolerance_mm=0.4,
+        most_faces=900,
         mesh_normals=True,
     )
     text = recipe.to_json()
     again = Recipe.from_json(text)
-    assert again.to_json() == text and (again.max_sweeps, again.tolerance, again.mesh_normals) == (7, 0.03, True)
+    assert again.to_json() == text
+    for field in dataclasses.fields(Recipe):
+        if field.name not in ("scheme", "free", "priors", "loss"):
+            assert getattr(again, field.name) == getattr(recipe, field.name) != field.default or field.name == "limit"
     for name in ("scheme", "free", "priors", "loss"):
         same(getattr(again, name), getattr(recipe, name))
     assert json.loads(text)["priors"]["h"] == "inf"
@@ -216,6 +227,32 @@ def test_recipe_replays_the_fit_bit_for_bit(saved):
     same(again.control, noisy().control)
     np.testing.assert_array_equal(again.rms, noisy().rms)
     assert len(recipe.fit(mesh, noisy().scan, throw=False, max_sweeps=1).rms) == 2
+
+
+@pytest.mark.filterwarnings("ignore:alignment")  # two poses of so plain a shape fit alike
+def test_recipe_of_a_fit_of_a_scan_does_all_of_it_again():
+    """Alignment and all: another scan is fitted as the one whose recipe it is."""
+    p = problem()
+    mesh = js.ControlMesh(p.start.vertices, p.mesh.faces, p.start.normals)
+    settings = {"pose": "rigid", "tolerance_mm": 0.01, "most_faces": 50, "faces": 90, "kind": "quad", "closed": True}
+    settings |= {"levels": 1, "max_sweeps": 3, "landmark_deviation": 0.5}
+    how = {"landmarks": fitting.Landmarks(np.asarray(p.truth.vertices)[:4] + (0, 0, 2.0), np.arange(4)), "throw": False}
+    scans = [fitting.Scan(p.points + noise(seed)) for seed in range(2)]
+    first = fitting.fit_scan(scans[0], mesh, scheme=js.Interpolating(1.1), **settings, **how)
+    recipe = Recipe.from_json(first.result.recipe.to_json())
+    assert {name: getattr(recipe, name) for name in settings} == settings and recipe.scheme.h == 1.1
+    again = recipe.fit_scan(scans[1], mesh, **how)
+    by_hand = fitting.fit_scan(scans[1], mesh, scheme=js.Interpolating(1.1), **settings, **how)
+    assert again.outcome == by_hand.outcome is not None
+    same(again.result.control, by_hand.result.control)
+    assert len(recipe.fit_scan(scans[1], mesh, max_sweeps=1, **how).result.rms) == 2  # options come before its own
+
+
+def test_recipes_of_version_1_have_the_defaults_of_what_they_did_not_know():
+    values = json.loads(Recipe(js.Interpolating(), 2).to_json()) | {"version": 1}
+    for name in ("landmark_deviation", "faces", "kind", "closed", "pose", "tolerance_mm", "most_faces"):
+        values.pop(name)
+    assert Recipe.from_json(json.dumps(values)).to_json() == Recipe(js.Interpolating(), 2).to_json()
 
 
 def test_recipe_that_says_little_has_the_defaults_of_fit():
@@ -239,7 +276,21 @@ def test_recipe_that_says_little_has_the_defaults_of_fit():
         ('{"scheme": {"name": "Loop"}, "levels": true}', "`levels` must be a whole number; got True"),
         ('{"scheme": {"name": "Loop"}, "levels": 2, "tolerance": "small"}', "`tolerance` must be a number"),
         ('{"scheme": {"name": "Loop"}, "levels": 2, "limit": 1}', "`limit` must be true or false; got 1"),
-        ('{"scheme": {"name": "Loop"}, "levels": 2, "prior": {}}', "a recipe has no 'prior'; it has free"),
+        ('{"scheme": {"name": "Loop"}, "levels": 2, "faces": 5.5}', "`faces` must be a whole number; got 5.5"),
+        ('{"scheme": {"name": "Loop"}, "levels": 2, "tolerance_mm": "0"}', "`tolerance_mm` must be a number"),
+        ('{"scheme": {"name": "Loop"}, "levels": 2, "closed": 1}', "`closed` must be true or false; got 1"),
+        (
+            '{"scheme": {"name": "Loop"}, "levels": 2, "kind": "hexagon"}',
+            '`kind` must be one of "triangle", "quad"; got "hexagon"',
+        ),
+        (
+            '{"scheme": {"name": "Loop"}, "levels": 2, "pose": "none"}',
+            '`pose` must be one of "rigid", "similarity", "affine", null; got "none"',
+        ),
+        (
+            '{"scheme": {"name": "Loop"}, "levels": 2, "prior": {}}',
+            "a recipe has no 'prior'; it has closed, faces",
+        ),
         ('{"scheme": {"name": "Loop"}, "levels": 2, "priors": {"bend": -1}}', "`priors` is not as it should be: .*-1"),
         ('{"scheme": {"name": "Loop"}, "levels": 2, "priors": 3}', "`priors` must be an object"),
     ],

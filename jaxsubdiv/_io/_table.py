@@ -13,6 +13,7 @@ from ._contents import Contents
 from ._text import decode
 
 _POSITION, _NORMAL, _WEIGHT = ("x", "y", "z"), ("nx", "ny", "nz"), "weight"
+_POINT = "Write decimals with a point."
 _EXPECTED = (
     "Without a header row there must be 3 columns (x, y, z) or 6 (x, y, z, nx, ny, nz); with others, name them in a "
     "first row, of x, y, z, nx, ny, nz, weight. Columns of other names are left out."
@@ -36,6 +37,8 @@ def read(path: Path) -> Contents:
         if len(cells) not in (3, 6):
             raise MeshError(f"{path.name}, line {number}: {len(cells)} columns. {_EXPECTED}")
         names = [*_POSITION, *_NORMAL][: len(cells)]
+    elif all(_is_number(part.replace(",", ".")) for part in first.split()):
+        raise MeshError(f"{path.name}, line {number}: '{first.split()[0][:40]}' is not a number. {_POINT}")
     else:
         names = [cell.lower() for cell in cells]
         _check_names(path, number, names)
@@ -48,7 +51,19 @@ def read(path: Path) -> Contents:
             f"{path.name}, line {name_rows(rows[i][0] for i in bad)}: a number is not finite. Delete these rows."
         )
     has_normals, has_weights = "nx" in wanted, _WEIGHT in wanted
+    headless = len(rows) > 0 and rows[0][0] == number
+    whole = not any("." in text for _, text in rows)
+    if headless and whole and len(names) == 6 and delimiter == "," and _are_halves(table):
+        raise MeshError(
+            f"{path.name}: 6 columns of whole numbers, the last three of them no normals: decimal commas, it seems. "
+            "Write decimals with a point, or name the columns in a first row."
+        )
     return Contents(table[:, :3], None, table[:, 3:6] if has_normals else None, table[:, -1] if has_weights else None)
+
+
+def _are_halves(table: Float[np.ndarray, "p 6"]) -> bool:
+    """Whether rows of six whole numbers are three that were cut at their decimal commas: 1,25 read as 1 and 25."""
+    return bool(np.median(np.linalg.norm(table[:, 3:6], axis=1)) > 2)  # of normals it is about 1
 
 
 def _check_names(path: Path, number: int, names: list[str]) -> None:
@@ -84,12 +99,13 @@ def _raise_bad_row(
     for number, text in rows:
         cells = _split(text, delimiter)
         if len(cells) != n_columns:
-            raise MeshError(f"{path.name}, line {number}: {len(cells)} columns, where the first row has {n_columns}.")
+            halves = f" {_POINT}" if delimiter == "," and len(cells) == 2 * n_columns else ""
+            raise MeshError(
+                f"{path.name}, line {number}: {len(cells)} columns, where the first row has {n_columns}.{halves}"
+            )
         for place in places:
             if not _is_number(cells[place]):
-                raise MeshError(
-                    f"{path.name}, line {number}: '{cells[place][:40]}' is not a number. Write decimals with a point."
-                )
+                raise MeshError(f"{path.name}, line {number}: '{cells[place][:40]}' is not a number. {_POINT}")
     raise MeshError(f"{path.name}: the numbers cannot be read. Write them in plain digits, such as -1.5e-3.")
 
 

@@ -206,20 +206,22 @@ def nearest(mesh: Trimesh, points: Float[np.ndarray, "p 3"]) -> Samples:
 def jaxsubdiv(problem: Problem, scheme: js.AbstractScheme) -> Trimesh:
     template = problem.template(TEMPLATE_VERTICES)
     mesh = js.ControlMesh(template.vertices, template.faces, template.vertex_normals)
-    return surface_of(fitting.fit_scan(fitting.Scan(problem.scan), mesh, scheme=scheme, throw=False))
+    return surface_of(fitting.fit_scan(fitting.Scan(problem.scan), mesh, scheme=scheme, levels=2, throw=False))
 
 
 def jaxsubdiv_alone(problem: Problem) -> Trimesh:
     """Without a template, at as many faces."""
     faces = 2 * TEMPLATE_VERTICES - 4
-    return surface_of(fitting.fit_scan(fitting.Scan(problem.scan), faces=faces, closed=True, throw=False))
+    return surface_of(fitting.fit_scan(fitting.Scan(problem.scan), faces=faces, closed=True, levels=2, throw=False))
 
 
 def jaxsubdiv_split(problem: Problem) -> Trimesh:
     """The template split once: four times the control vertices."""
     template = problem.template(TEMPLATE_VERTICES)
     mesh = js.ControlMesh(template.vertices, template.faces, template.vertex_normals)
-    found = fitting.fit_scan(fitting.Scan(problem.scan), mesh, tolerance_mm=0.01, most_faces=6000, throw=False)
+    found = fitting.fit_scan(
+        fitting.Scan(problem.scan), mesh, levels=2, tolerance_mm=0.01, most_faces=6000, throw=False
+    )
     return surface_of(found)
 
 
