@@ -42,3 +42,5 @@ from ._scan import Scan as Scan
 from ._scan import ScanError as ScanError
 from ._scan import read_scan as read_scan
 from ._search import search_closest as search_closest
+from ._symmetry import Symmetry as Symmetry
+from ._symmetry import find_symmetry as find_symmetry

@@ -25,6 +25,7 @@ from ._residuals import Anchors, Priors
 from ._result import FitResult
 from ._robust import AbstractLoss, geman_mcclure
 from ._scan import Scan, ScanError
+from ._symmetry import Symmetry, find_symmetry, symmetry_of
 
 # A start that is off by more than this part of the control mesh's size is not roughly aligned.
 _FAR = 0.05
@@ -59,6 +60,7 @@ def fit(
     loss: AbstractLoss | None = None,
     landmarks: Landmarks | None = None,
     landmark_deviation: float = 1.0,
+    symmetry: Symmetry | None = None,
     max_sweeps: int = 60,
     tolerance: float = 0.1,
     throw: bool = True,
@@ -82,6 +84,8 @@ def fit(
         loss: how a point loses weight with its distance; default: `geman_mcclure()`.
         landmarks: places on the scan and on the control mesh where it starts, which the fit keeps together.
         landmark_deviation: how far they may be apart, as a standard deviation in mm; a weight divides its square.
+        symmetry: the partners that `Priors.symmetry` ties; default, where it is given: those that `find_symmetry` finds
+            on the control mesh where the fit starts.
         max_sweeps: how many sweeps at most.
         tolerance: converged once a sweep, annealed, moves nine tenths of the surface, and the RMS distance, by less
             than this part of the surface's uncertainty, which is about noise / sqrt(points a control vertex); or of a
@@ -92,12 +96,14 @@ def fit(
     Raises:
         UserWarning: the start is so far off that the fit will hardly find its way.
         ScanError: the sizes of scan and control mesh differ as by a wrong unit, or there are too few points.
-        ValueError: the topology has no levels, or does not fit the control.
+        ValueError: the topology has no levels, or does not fit the control; or the control mesh has no symmetry, though
+            the priors ask for it.
         RuntimeError: with `throw`, the fit did not converge or met values that are not finite.
     """
     check(scheme, topology, control, scan)
     # Made here and not in the signature: arrays made while a module loads would settle JAX's device and precision.
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
+    symmetry = _partners(symmetry, priors, topology, control)
     control = js.Control(control.vertices, given_normals(topology, control))
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
     recipe = Recipe.of(scheme, topology, **settings)
@@ -110,7 +116,7 @@ def fit(
     _warn_if_far(float(np.median(np.abs(seen.distances))), control)
     rms, robust_rms, result = [float(seen.rms)], [float(seen.robust_rms)], optx.RESULTS.nonlinear_max_steps_reached
     anchors = None if landmarks is None else _anchors(landmarks, landmark_deviation, topology, control, surface)
-    problem = Problem(scheme, topology, control, free, priors, anchors)
+    problem = Problem(scheme, topology, control, free, priors, anchors, symmetry)
     for sweep in range(max_sweeps):
         proposed = _apply(topology, scheme, control, problem.step(scheme, control, seen))
         refined = js.refine(proposed[0], topology, proposed[1])
@@ -156,6 +162,19 @@ def fit(
 
 
 _apply = eqx.filter_jit(apply_offset)
+
+
+def _partners(symmetry: Symmetry | None, priors: Priors, topology: js.Topology, control: js.Control) -> Symmetry | None:
+    """Those that the prior ties, where there is one."""
+    if not np.isfinite(priors.symmetry):
+        if symmetry is not None:
+            raise ValueError(
+                "`symmetry` says who is whose image; say how near, too: priors=Priors(symmetry=1.0), in mm."
+            )
+        return None
+    if symmetry is None:
+        return find_symmetry(js.ControlMesh(control.vertices, topology.control_faces, check=False))
+    return symmetry_of(symmetry.partner, np.asarray(control.vertices))
 
 
 @eqx.filter_jit

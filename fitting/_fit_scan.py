@@ -17,6 +17,7 @@ from ._fit import fit
 from ._landmarks import Landmarks
 from ._result import FitResult
 from ._scan import Scan
+from ._symmetry import find_symmetry
 
 Outcome: TypeAlias = Literal["tolerance met", "noise reached", "no more faces"]
 
@@ -70,13 +71,14 @@ def fit_scan(
             `most_faces` or for two points a control vertex.
         most_faces: of the control mesh, where it is split.
         on_stage: told what begins, in a few words.
-        options: of `fit`.
+        options: of `fit`. Where `priors` ask for symmetry, the partners are found on the template as it is given.
 
     Raises:
         ScanError, ValueError, ImportError, RuntimeError: as `align`, `control_mesh` and `fit` do.
     """
     say = on_stage or (lambda words: None)
     scheme, alignment = scheme or js.Interpolating(), None
+    given = mesh  # an affine pose leaves no mirror plane, and a fit no exact one
     if mesh is None:
         say(f"makes a control mesh of about {faces} faces")
         mesh = control_mesh(scan, faces=faces, kind=kind, closed=closed)
@@ -87,8 +89,10 @@ def fit_scan(
         alignment = align(mesh, scan, kind=pose, landmarks=landmarks)
         landmarks = None if landmarks is None else moved(landmarks, mesh, alignment)
         mesh = alignment.mesh
-    splits = 0
+    priors, splits = options.get("priors"), 0
     while True:
+        if priors is not None and np.isfinite(priors.symmetry) and given is not None and "symmetry" not in options:
+            options["symmetry"] = find_symmetry(given)
         say(f"fits {len(mesh.vertices):,} control vertices")
         # Tables come from the faces alone; normals that would fold the surface are replaced in the fit.
         topology = js.build_topology(js.ControlMesh(mesh.vertices, mesh.faces), scheme, levels)
@@ -101,7 +105,9 @@ def fit_scan(
             return ScanFit(result, mesh, alignment, splits, outcome)
         scheme, splits = result.scheme, splits + 1
         landmarks = None  # their places were those of the template
-        mesh = _split(result, mesh)
+        options.pop("symmetry", None)  # and so were its partners
+        mesh = _split(result.scheme, mesh, result.control)
+        given = None if given is None else _split(result.scheme, given, given.control(weights=scheme.weights))
 
 
 def misfit(result: FitResult) -> float:
@@ -132,13 +138,12 @@ def _outcome(result: FitResult, mesh: js.ControlMesh, tolerance_mm: float | None
     return "no more faces" if too_many else None
 
 
-def _split(result: FitResult, mesh: js.ControlMesh) -> js.ControlMesh:
-    """The fitted control mesh, every face cut in four by the scheme's rule: the same surface, with more to move."""
-    scheme = result.scheme
+def _split(scheme: js.AbstractScheme, mesh: js.ControlMesh, control: js.Control) -> js.ControlMesh:
+    """A control mesh of these faces, each cut in four by the scheme's rule: the same surface, with more to move."""
     if scheme.h is not None and scheme.h.ndim:  # one h a level: what is left of it serves the split mesh
         scheme = dataclasses.replace(scheme, h=scheme.h[:1])
-    fitted = js.ControlMesh(result.control.vertices, mesh.faces, result.control.normals, check=False)
-    finer = js.refine(scheme, js.build_topology(fitted, scheme, 1), result.control)
+    fitted = js.ControlMesh(control.vertices, mesh.faces, control.normals, check=False)
+    finer = js.refine(scheme, js.build_topology(fitted, scheme, 1), control)
     return js.ControlMesh(finer.vertices, finer.faces, finer.normals if scheme.uses_normals else None)
 
 

@@ -39,6 +39,7 @@ from ._residuals import (
     control_faces_of,
     prior_faces,
 )
+from ._symmetry import Mirror, Symmetry, Ties, mirror_at, ties
 
 # Standard deviation of a step in control edges: what neither scan nor priors hold stays near where it is. A control
 # vertex that turns back is held faster, and one that goes on is let go again: where the surface cannot follow the scan
@@ -63,6 +64,13 @@ class _Equations(NamedTuple):
     gradient: Float[np.ndarray, "n"]
     bends: Float[np.ndarray, "b"]
     by_bend: Float[np.ndarray, "b d"]
+    ties: Ties | None
+    """Of the prior of symmetry, whose rows lie in no control face."""
+
+    @property
+    def tied(self) -> sp.csc_array | None:
+        """Its matrix."""
+        return None if self.ties is None else (self.ties.by.T @ self.ties.by).tocsc()
 
 
 class Found(NamedTuple):
@@ -75,6 +83,7 @@ class Found(NamedTuple):
     determined: float
     annealed: bool
     anchors: Anchors | None
+    symmetry: Symmetry | None = None
 
 
 class Problem:
@@ -88,8 +97,10 @@ class Problem:
         free: Free,
         priors: Priors,
         anchors: Anchors | None = None,
+        symmetry: Symmetry | None = None,
     ):
         self._topology, self.free, self._priors, self._anchors = topology, free, priors, anchors
+        self._symmetry = symmetry
         self._template = np.asarray(control.vertices, np.float64)
         self._zero = no_offset(free, scheme, control)
         masks = free.of(scheme, len(self._template))
@@ -111,12 +122,17 @@ class Problem:
     def step(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> Unknowns:
         """The most probable offset from here, to first order. It also finds the next strength of the bend prior."""
         found = self._equations(scheme, control, seen)
-        held = factorise(self._matrix(found.data + found.prior, self._hold))
+        tied = found.tied
+        held = factorise(self._matrix(found.data + found.prior, self._hold, tied))
         step = np.zeros(self.elements.n)
         step[self.is_free] = -held.solve(found.gradient[self.is_free])
+        if found.ties is not None:
+            step = found.ties.with_plane(step, held.solve, self.is_free)
         # What is held says nothing of what the scan determines.
         loose = (
-            factorise(self._matrix(found.data + found.prior, self.loose)) if np.any(self._hold > self.loose) else held
+            factorise(self._matrix(found.data + found.prior, self.loose, tied))
+            if np.any(self._hold > self.loose)
+            else held
         )
         self._hold_what_turns_back(step)
         self._count_determined(found.data, loose)
@@ -129,7 +145,7 @@ class Problem:
     def precision_matrix(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> sp.csc_array:
         """Of the free unknowns, about here: the inverse of their covariance."""
         found = self._equations(scheme, control, seen)
-        return self._matrix(found.data + found.prior, self.loose)
+        return self._matrix(found.data + found.prior, self.loose, found.tied)
 
     def _equations(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> _Equations:
         start = self.start(scheme, control)
@@ -151,7 +167,17 @@ class Problem:
         weights, of_priors = np.concatenate(self.prior_precisions()), np.concatenate(faces)
         gradient += times_transposed(elements, by_priors, weights * np.concatenate(rows[1:]), of_priors)
         prior = normal_matrix(elements, by_priors, weights, of_priors)
-        return _Equations(data, prior, gradient, np.asarray(rows.bend), by_priors[: len(rows.bend)])
+        mirror = self.mirror(control)
+        tied = None if mirror is None else ties(mirror, control, self._zero)
+        if tied is not None:
+            gradient += tied.by.T @ tied.rows
+        return _Equations(data, prior, gradient, np.asarray(rows.bend), by_priors[: len(rows.bend)], tied)
+
+    def mirror(self, control: js.Control) -> Mirror | None:
+        """The prior of symmetry about here; None where there is none."""
+        if self._symmetry is None:
+            return None
+        return mirror_at(self._symmetry, float(self._priors.symmetry), self._topology, control, self._zero)
 
     def prior_precisions(self) -> Rows:
         """1 / variance of every row of the priors; there are none of distances."""
@@ -211,7 +237,7 @@ class Problem:
             found.bends + by @ step[self.is_free],
             by,
             self._faces.bend,
-            factorise(self._matrix(found.prior, self.loose)).solve,
+            factorise(self._matrix(found.prior, self.loose, found.tied)).solve,
             factor.solve,
             self._around,
         )
@@ -276,16 +302,17 @@ class Problem:
 
     def found(self) -> Found:
         """What a problem made anew has to be told, to know as much as this one."""
-        return Found(self._template, self._precision, self.determined, self.annealed, self._anchors)
+        return Found(self._template, self._precision, self.determined, self.annealed, self._anchors, self._symmetry)
 
     def tell(self, found: Found) -> None:
         """Take over what the sweeps of another problem found."""
         self._precision, self.determined, self.annealed = found.bend_precision, found.determined, found.annealed
 
-    def _matrix(self, values: np.ndarray, diagonal: np.ndarray) -> sp.csc_array:
+    def _matrix(self, values: np.ndarray, diagonal: np.ndarray, tied: sp.csc_array | None = None) -> sp.csc_array:
         pattern = self.elements.pattern
         whole = sp.csc_array((values, pattern.indices, pattern.indptr), shape=pattern.shape)
         whole = (whole + sp.diags_array(diagonal)).tocsc()
+        whole = whole if tied is None else (whole + tied).tocsc()
         return whole if self.is_free.all() else whole[self.is_free][:, self.is_free].tocsc()
 
     def _trace(self, values: np.ndarray) -> float:

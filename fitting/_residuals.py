@@ -44,6 +44,9 @@ class Priors(eqx.Module):
         stretch: of the change of a control edge along the surface, against the control mesh where the fit starts, as a
             part of the edge's length. It keeps the control vertices in their places where the scan does not.
         h: of the tangent length coefficient about 1.
+        symmetry: of the departure of a control vertex from the mirror image of its partner in mm, in each coordinate;
+            of control normals, by as much as they move the surface. Default: left out. The mirror plane moves along
+            with the mesh; `fit` finds the partners, or is given them (see `find_symmetry`).
 
     Raises:
         ValueError: a standard deviation is not positive.
@@ -54,6 +57,7 @@ class Priors(eqx.Module):
     )
     stretch: Float[Array, ""] = eqx.field(converter=_positive, default=0.2)
     h: Float[Array, ""] = eqx.field(converter=_positive, default=0.05)
+    symmetry: Float[Array, ""] = eqx.field(converter=_positive, default=np.inf)
 
 
 class Pairs(NamedTuple):
