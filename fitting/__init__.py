@@ -2,6 +2,8 @@
 
 from ._align import Alignment as Alignment
 from ._align import align as align
+from ._boundary import BoundaryCurve as BoundaryCurve
+from ._boundary import boundary_of as boundary_of
 from ._cohort import Cohort as Cohort
 from ._cohort import fit_cohort as fit_cohort
 from ._control_mesh import control_mesh as control_mesh

@@ -202,8 +202,8 @@ def fit_cohort(
         raise ValueError(f"there are {len(scans)} scans and {len(controls)} controls: give one or more, and one each.")
     if np.isfinite(priors.symmetry):
         raise ValueError(
-            "a cohort has no prior of symmetry: its steps do not solve for a mirror plane. Leave `Priors.symmetry` out, "
-            "or call `fit` for each scan."
+            "a cohort has no prior of symmetry: its steps do not solve for a mirror plane. Leave `Priors.symmetry` "
+            "out, or call `fit` for each scan."
         )
     for i, (control, scan) in enumerate(zip(controls, scans, strict=True)):
         try:

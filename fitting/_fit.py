@@ -15,6 +15,7 @@ import jaxsubdiv as js
 from jaxsubdiv._linalg import dot, unit
 from jaxsubdiv._surface import corner_weights
 
+from ._boundary import BoundaryCurve, checked_curve, held_vertices
 from ._correspondence import boundary_vertices, closest_points
 from ._free import Free, apply_offset, edge_length
 from ._landmarks import Landmarks, place_landmarks
@@ -61,6 +62,7 @@ def fit(
     landmarks: Landmarks | None = None,
     landmark_deviation: float = 1.0,
     symmetry: Symmetry | None = None,
+    boundary: BoundaryCurve | None = None,
     max_sweeps: int = 60,
     tolerance: float = 0.1,
     throw: bool = True,
@@ -86,6 +88,8 @@ def fit(
         landmark_deviation: how far they may be apart, as a standard deviation in mm; a weight divides its square.
         symmetry: the partners that `Priors.symmetry` ties; default, where it is given: those that `find_symmetry` finds
             on the control mesh where the fit starts.
+        boundary: a curve that the open surface ends at: its boundary follows from the points of the curve, and scan
+            points beyond it do not count.
         max_sweeps: how many sweeps at most.
         tolerance: converged once a sweep, annealed, moves nine tenths of the surface, and the RMS distance, by less
             than this part of the surface's uncertainty, which is about noise / sqrt(points a control vertex); or of a
@@ -110,13 +114,19 @@ def fit(
     start = control
     surface = js.refine(scheme, topology, control)
     open_vertices, edge = boundary_vertices(surface), float(edge_length(topology, control.vertices))
+    curve = None if boundary is None else checked_curve(boundary, topology)
+
+    def seen_from(surface: js.RefinedSurface, floor: float) -> Look:
+        held = None if curve is None else held_vertices(curve, surface, edge)
+        return look(surface, scan, open_vertices, around, edge, loss, floor, held)
+
     around = surroundings(scan)
-    seen = look(surface, scan, open_vertices, around, edge, loss, LEAST_NOISE * edge)
+    seen = seen_from(surface, LEAST_NOISE * edge)
     widest = float(seen.scale)  # a robust scale of the start's own error: outliers must not widen it
     _warn_if_far(float(np.median(np.abs(seen.distances))), control)
     rms, robust_rms, result = [float(seen.rms)], [float(seen.robust_rms)], optx.RESULTS.nonlinear_max_steps_reached
     anchors = None if landmarks is None else _anchors(landmarks, landmark_deviation, topology, control, surface)
-    problem = Problem(scheme, topology, control, free, priors, anchors, symmetry)
+    problem = Problem(scheme, topology, control, free, priors, anchors, symmetry, curve)
     for sweep in range(max_sweeps):
         proposed = _apply(topology, scheme, control, problem.step(scheme, control, seen))
         refined = js.refine(proposed[0], topology, proposed[1])
@@ -126,7 +136,7 @@ def fit(
         moved = float(surface_moved(surface, refined))
         (scheme, control), surface = proposed, refined
         floor = max(widest * 0.5 ** (sweep + 1), LEAST_NOISE * edge)
-        seen = look(surface, scan, open_vertices, around, edge, loss, floor)
+        seen = seen_from(surface, floor)
         rms.append(float(seen.rms))
         robust_rms.append(float(seen.robust_rms))
         if on_sweep is not None:
@@ -168,9 +178,7 @@ def _partners(symmetry: Symmetry | None, priors: Priors, topology: js.Topology, 
     """Those that the prior ties, where there is one."""
     if not np.isfinite(priors.symmetry):
         if symmetry is not None:
-            raise ValueError(
-                "`symmetry` says who is whose image; say how near, too: priors=Priors(symmetry=1.0), in mm."
-            )
+            raise ValueError("`symmetry` says who is whose image; say how near in mm, too: Priors(symmetry=1.0).")
         return None
     if symmetry is None:
         return find_symmetry(js.ControlMesh(control.vertices, topology.control_faces, check=False))

@@ -12,6 +12,7 @@ from scipy.sparse.linalg import SuperLU, splu
 import jaxsubdiv as js
 from jaxsubdiv._linalg import unit
 
+from ._boundary import BoundaryCurve, pair_with_boundary
 from ._correspondence import AnyArray
 from ._elements import (
     Elements,
@@ -84,6 +85,7 @@ class Found(NamedTuple):
     annealed: bool
     anchors: Anchors | None
     symmetry: Symmetry | None = None
+    curve: BoundaryCurve | None = None
 
 
 class Problem:
@@ -98,9 +100,10 @@ class Problem:
         priors: Priors,
         anchors: Anchors | None = None,
         symmetry: Symmetry | None = None,
+        curve: BoundaryCurve | None = None,
     ):
         self._topology, self.free, self._priors, self._anchors = topology, free, priors, anchors
-        self._symmetry = symmetry
+        self._symmetry, self._curve = symmetry, curve
         self._template = np.asarray(control.vertices, np.float64)
         self._zero = no_offset(free, scheme, control)
         masks = free.of(scheme, len(self._template))
@@ -152,7 +155,7 @@ class Problem:
         face = self._owner[np.asarray(seen.at.face)]
         if self._elements is None:
             self._elements = self._analyse(start, seen, face)
-        elements, faces = self._elements, self._faces
+        elements = self._elements
         data, gradient = np.zeros(elements.pattern.nnz), np.zeros(elements.n)
         rows, by_priors = None, np.zeros((0, 0))
         for part, counts, at in padded(seen.pairs, self.distance_precisions(seen), face):
@@ -164,7 +167,7 @@ class Problem:
         if not len(self._precision):
             # As smooth as the template, to begin with.
             self._set_bend(np.full(len(elements.columns), 1 / max(float(np.mean(np.square(rows.bend))), _TINY)))
-        weights, of_priors = np.concatenate(self.prior_precisions()), np.concatenate(faces)
+        weights, of_priors = np.concatenate(self.prior_precisions()), self._row_faces(start)
         gradient += times_transposed(elements, by_priors, weights * np.concatenate(rows[1:]), of_priors)
         prior = normal_matrix(elements, by_priors, weights, of_priors)
         mirror = self.mirror(control)
@@ -189,6 +192,7 @@ class Problem:
             stretch=np.full(len(faces.stretch), stretch),
             margin=np.ones(len(faces.margin)),
             landmark=np.ones(len(faces.landmark)),
+            rim=np.ones(0 if self._curve is None else 2 * len(self._curve.points)),
             h=np.full(len(faces.h), h),
         )
 
@@ -201,7 +205,17 @@ class Problem:
         """The arguments of the residuals, for a sweep that starts here."""
         template = moved_to(self._template, np.asarray(control.vertices, np.float64))
         template = jnp.asarray(template, control.vertices.dtype)
-        return Start(scheme, self._topology, control, template, self._anchors, self._edges, self._bend_edges)
+        rim = None
+        if self._curve is not None:
+            rim = pair_with_boundary(self._curve, js.refine(scheme, self._topology, control))
+        return Start(scheme, self._topology, control, template, self._anchors, self._edges, self._bend_edges, rim)
+
+    def _row_faces(self, start: Start, distance: Int[np.ndarray, "p"] | None = None) -> Int[np.ndarray, "m"]:
+        """The control face of every row, of the distances where there are any."""
+        faces = self._faces if distance is None else self._faces._replace(distance=distance)
+        if start.rim is not None:
+            faces = faces._replace(rim=np.repeat(self._owner[np.asarray(start.rim.face)], 2))
+        return np.concatenate(faces)
 
     def across(
         self, scheme: js.AbstractScheme, control: js.Control
@@ -273,7 +287,7 @@ class Problem:
         pairs, _, face = next(padded(seen.pairs, np.asarray(seen.precisions), face))
         for rings in range(1, _MOST_RINGS + 1):
             found = find_elements(self._topology, self.free, start, rings)
-            row_faces = np.concatenate(self._faces._replace(distance=face))
+            row_faces = self._row_faces(start, face)
             _, by, along = differentiate(self._zero, start, pairs, found.seeds, found.seeds_of[row_faces])
             if not forgets_some(found, np.asarray(by), row_faces, np.asarray(along)):
                 return found
@@ -285,7 +299,7 @@ class Problem:
     def _differentiate(
         self, start: Start, pairs: Pairs, face: Int[np.ndarray, "p"]
     ) -> tuple[Rows, Float[np.ndarray, "m d"]]:
-        seeds_of = self.elements.seeds_of[np.concatenate(self._faces._replace(distance=face))]
+        seeds_of = self.elements.seeds_of[self._row_faces(start, face)]
         rows, by, _ = differentiate(self._zero, start, pairs, self.elements.seeds, seeds_of)
         return jax.tree.map(lambda values: np.asarray(values, np.float64), (rows, by))
 
@@ -302,7 +316,9 @@ class Problem:
 
     def found(self) -> Found:
         """What a problem made anew has to be told, to know as much as this one."""
-        return Found(self._template, self._precision, self.determined, self.annealed, self._anchors, self._symmetry)
+        return Found(
+            self._template, self._precision, self.determined, self.annealed, self._anchors, self._symmetry, self._curve
+        )
 
     def tell(self, found: Found) -> None:
         """Take over what the sweeps of another problem found."""

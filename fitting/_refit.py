@@ -128,6 +128,7 @@ def make_refit(posterior: Posterior) -> Refit:
     def on_device(values: object) -> Array:
         return jnp.asarray(values, dtype)
 
+    mirror = problem.mirror(posterior.control)
     return Refit(
         _Fixed(
             start=problem.start(posterior.scheme, posterior.control),
@@ -136,9 +137,7 @@ def make_refit(posterior: Posterior) -> Refit:
             precisions=on_device(problem.distance_precisions(posterior.seen)),
             prior_precisions=Rows(*map(on_device, problem.prior_precisions())),
             hold=on_device(problem.loose),
-            mirror=jax.tree.map(
-                lambda a: on_device(a) if a.dtype.kind == "f" else a, problem.mirror(posterior.control)
-            ),
+            mirror=jax.tree.map(lambda a: on_device(a) if a.dtype.kind == "f" else a, mirror),
             whitening=on_device(whitening),
         )
     )

@@ -19,6 +19,7 @@ from jaxsubdiv._half_edges import HalfEdges, half_edges
 from jaxsubdiv._linalg import cross, dot, norm, take, unit
 from jaxsubdiv._surface import sum_corners
 
+from ._boundary import Rim
 from ._free import Unknowns, apply_offset, edge_length
 
 # A normal that leans less than this, as a cosine, from the faces around it keeps the surface smooth; it may be a little
@@ -96,6 +97,7 @@ class Start(NamedTuple):
     """Control edges."""
     bend_edges: Int[Array | np.ndarray, "b 2"]
     """Edges of which the bends are compared."""
+    rim: Rim | None = None
 
 
 class Rows(NamedTuple):
@@ -109,6 +111,8 @@ class Rows(NamedTuple):
     """One a corner of the control faces, over its own standard deviation."""
     landmark: Float[Array | np.ndarray, "l"]
     """Three a landmark, over its standard deviation."""
+    rim: Float[Array | np.ndarray, "r"]
+    """Two a point of the boundary curve, over its standard deviation."""
     h: Float[Array | np.ndarray, "n"]
     """h - 1."""
 
@@ -126,6 +130,7 @@ def residuals(offset: Unknowns, start: Start, pairs: Pairs) -> Rows:
         stretch=_stretch(start, control),
         margin=_margin_rows(start.topology, control) if scheme.uses_normals else none,
         landmark=none if start.anchors is None else _anchor_rows(start.anchors, surface),
+        rim=none if start.rim is None else start.rim.rows(surface.vertices),
         h=none if offset.h is None else jnp.atleast_1d(scheme.h).astype(dtype) - 1,
     )
 
@@ -210,6 +215,8 @@ class RowFaces(NamedTuple):
     stretch: Int[np.ndarray, "s"]
     margin: Int[np.ndarray, "c"]
     landmark: Int[np.ndarray, "l"]
+    rim: Int[np.ndarray, "r"]
+    """None yet: every sweep pairs the boundary anew."""
     h: Int[np.ndarray, "n"]
 
 
@@ -236,6 +243,7 @@ def prior_faces(
         stretch=np.repeat(of_edge, 3),
         margin=np.concatenate(corners) if scheme.uses_normals else np.zeros(0, int),
         landmark=np.zeros(0, int) if anchors is None else np.repeat(owner[np.asarray(anchors.face)], 3),
+        rim=np.zeros(0, int),
         h=np.zeros(n_h, int),
     )
 

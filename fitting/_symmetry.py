@@ -75,15 +75,16 @@ def find_symmetry(mesh: js.ControlMesh, *, tolerance: float = 0.05) -> Symmetry:
     edge = float(np.sqrt(np.mean(np.sum((vertices[a] - vertices[b]) ** 2, axis=1))))
     near, tree = tolerance * edge, KDTree(vertices)
     probes = vertices[:: max(len(vertices) // _PROBES, 1)]
-    best, lonely = None, np.arange(len(vertices))
+    own = np.arange(len(vertices))
+    best, lonely = None, own
     for plane in _candidates(vertices, near):
         if np.median(tree.query(plane.mirrored(probes))[0]) > _PLAUSIBLE * edge:
             continue
+        partner = own
         for _ in range(_ROUNDS):
-            partner = tree.query(plane.mirrored(vertices))[1]
+            partner = np.asarray(tree.query(plane.mirrored(vertices))[1])
             plane = _plane_of(partner, vertices)
         away = np.linalg.norm(plane.mirrored(vertices[partner]) - vertices, axis=1)
-        own = np.arange(len(vertices))
         alone = np.flatnonzero((away > near) | (partner[partner] != own))
         if (partner == own).all():  # a flat mesh is its own image in its own plane
             continue
@@ -134,7 +135,7 @@ class Mirror(NamedTuple):
     def rows(self, control: js.Control, xp: Any = np) -> AnyArray:
         """Departures from symmetry over their standard deviation: three a pair, one a vertex on the plane; likewise
         those of the normals."""
-        parts = [control.vertices - self.plane.middle[None]]
+        parts: list[AnyArray] = [control.vertices - self.plane.middle[None]]
         if self.lever is not None:
             parts.append(self.lever * control.normals)
         found = []
@@ -200,7 +201,7 @@ def ties(mirror: Mirror, control: js.Control, zero: Unknowns) -> Ties:
     rows = mirror.rows(js.Control(vertices, normals))
     n_vertices, width = len(vertices), 3 * (zero.vertices is not None) + 2 * (zero.normals is not None)
     n = n_vertices * width + (0 if zero.h is None else zero.h.size)
-    m, left, right, alone = mirror.plane.normal, mirror.left, mirror.right, mirror.on_plane
+    left, right, alone, m = (np.asarray(part) for part in (*mirror[:3], mirror.plane.normal))
 
     def picked(which: Int[np.ndarray, "k"]) -> sp.csr_array:
         return sp.csr_array((np.ones(len(which)), (np.arange(len(which)), which)), shape=(len(which), n_vertices))
@@ -254,8 +255,8 @@ def _plane_of(partner: Int[np.ndarray, "v"], vertices: Float[np.ndarray, "v 3"])
 def _candidates(vertices: Float[np.ndarray, "v 3"], near: float) -> Iterator[Plane]:
     """Planes that could be mirrors: all those that can be, and the principal ones, which noise moves least.
 
-    A mirror leaves the middle where it is, and so every distance from it. It takes the farthest vertex to another at its
-    distance, or leaves it; then the one farthest from the line between goes to another, or stays too: all planes.
+    A mirror leaves the middle where it is, and so every distance from it. It takes the farthest vertex to another at
+    its distance, or leaves it; then the one farthest from the line between goes to another, or stays too: all planes.
     """
     middle = vertices.mean(axis=0)
     y = vertices - middle
