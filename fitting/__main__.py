@@ -19,12 +19,14 @@ from jaxsubdiv._compare import SCHEMES
 from jaxsubdiv._files import replacing
 from jaxsubdiv._warnings import plain_warnings
 
+from ._boundary import BoundaryCurve, boundary_of
 from ._example import Example, example
 from ._fit import Sweep
 from ._fit_scan import ScanFit, fit_scan, misfit
 from ._landmarks import Landmarks, match_landmarks, read_landmarks
 from ._page import write_page
 from ._picture import draw_fit, surface_distances
+from ._residuals import Priors
 from ._scan import Scan, read_scan
 
 _EXAMPLE_NOISE = 3.0  # mm: the example starts from a control mesh that is wrong, to show that the fit mends it
@@ -49,6 +51,7 @@ class _Job(NamedTuple):
     scan: Scan
     mesh: js.ControlMesh | None
     landmarks: Landmarks | None
+    boundary: BoundaryCurve | None = None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -115,6 +118,8 @@ def _run(scan: Path | None, folder: Path, options: argparse.Namespace) -> dict:
                 closed=options.closed,
                 pose=None if options.align == "none" else options.align,
                 landmarks=job.landmarks,
+                boundary=job.boundary,
+                priors=None if options.symmetry is None else Priors(symmetry=options.symmetry),
                 tolerance_mm=options.tolerance,
                 on_stage=progress.stage,
                 max_sweeps=options.max_sweeps,
@@ -163,7 +168,12 @@ def _inputs(scan: Path | None, options: argparse.Namespace) -> _Job:
             read_landmarks(options.landmarks, scale=options.scale),
             read_landmarks(options.control_landmarks, scale=options.control_scale),
         )
-    return _Job(scan.name, points, mesh, landmarks)
+    boundary = None
+    if options.boundary == "scan":
+        boundary = BoundaryCurve(boundary_of(js.read_mesh(scan, scale=options.scale, check=False)))
+    elif options.boundary is not None:
+        boundary = BoundaryCurve(js.read_points(options.boundary, scale=options.scale).points)
+    return _Job(scan.name, points, mesh, landmarks, boundary)
 
 
 def _ending(found: ScanFit, off: float) -> str:
@@ -290,6 +300,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--align", choices=("similarity", "rigid", "affine", "none"), default="similarity", help="of the template")
     add("--landmarks", metavar="FILE", help="named places on the scan, .json or .csv; the template's in the next")
     add("--control-landmarks", metavar="FILE", help="the same names on the template")
+    add("--symmetry", type=float, metavar="MM", help="keep the fit as symmetric as the template, but for so much")
+    add("--boundary", metavar="FILE", help="points of the curve that the open surface ends at; `scan`: the scan's rim")
     add("--tolerance", type=float, metavar="MM", help="split the control mesh until the surface is this near the scan")
     add("--label", help="only the rows of a .csv whose column `label` or `contour` holds this")
     add("--scale", type=float, default=1.0, help="multiplies the scan's coordinates; 1000 for metres")

@@ -49,6 +49,12 @@ class Rim(NamedTuple):
         return jnp.stack([dot(self.directions[:, i], away)[:, 0] for i in (0, 1)], axis=1).reshape(-1) / self.deviation
 
 
+class _Sides(NamedTuple):
+    start: Int[np.ndarray, "s"]
+    end: Int[np.ndarray, "s"]
+    face: Int[np.ndarray, "s"]
+
+
 def boundary_of(mesh: js.ControlMesh | js.RefinedSurface) -> Float[np.ndarray, "b 3"]:
     """Where an open mesh ends: its boundary vertices, of all its holes too, in the unit of the mesh.
 
@@ -79,7 +85,7 @@ def checked_curve(curve: BoundaryCurve, topology: js.Topology) -> BoundaryCurve:
         raise ScanError(f"`boundary` points are not finite in rows {name_rows(np.flatnonzero(~finite))}. Drop them.")
     if not 0 < deviation < np.inf:
         raise ScanError(f"the deviation of `boundary` must be positive and finite; got {deviation}.")
-    if not len(_boundary_sides(topology.control_faces)[0]):
+    if not len(_boundary_sides(topology.control_faces).start):
         raise ValueError("the control mesh is closed: it has no boundary that could lie on the curve of `boundary`.")
     return BoundaryCurve(points, deviation)
 
@@ -122,13 +128,11 @@ def held_vertices(curve: BoundaryCurve, surface: js.RefinedSurface, edge: float)
     return held
 
 
-def _boundary_sides(
-    faces: Mapping[int, Any],
-) -> tuple[Int[np.ndarray, "s"], Int[np.ndarray, "s"], Int[np.ndarray, "s"]]:
-    """Start, end and face of the half-edges that have no other beside them."""
+def _boundary_sides(faces: Mapping[int, Any]) -> _Sides:
+    """The half-edges that have no other beside them."""
     sides = half_edges({size: np.asarray(rows) for size, rows in faces.items()})
     alone = np.bincount(sides.edge, minlength=len(sides.edges))[sides.edge] == 1
-    return sides.start[alone], sides.end[alone], sides.face[alone]
+    return _Sides(sides.start[alone], sides.end[alone], sides.face[alone])
 
 
 def _unit(rows: Float[np.ndarray, "b 3"]) -> Float[np.ndarray, "b 3"]:
