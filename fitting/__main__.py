@@ -168,6 +168,8 @@ def _inputs(scan: Path | None, options: argparse.Namespace) -> _Job:
             read_landmarks(options.landmarks, scale=options.scale),
             read_landmarks(options.control_landmarks, scale=options.control_scale),
         )
+    if options.symmetry is not None and mesh is None:
+        raise ValueError("symmetry is that of a template: give --control MESH to --symmetry.")
     boundary = None
     if options.boundary == "scan":
         boundary = BoundaryCurve(boundary_of(js.read_mesh(scan, scale=options.scale, check=False)))

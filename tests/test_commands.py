@@ -296,8 +296,10 @@ def test_symmetry_and_boundary_reach_the_fit(files, monkeypatch, capsys):
     capsys.readouterr()
     assert run(fit, "scan.xyz", "--control", "control.obj", "--boundary", "scan") == 2
     assert run(fit, "scan.xyz", "--control", "control.obj", "--symmetry", "-1") == 2
+    assert run(fit, "scan.xyz", "--symmetry", "1") == 2
     words = capsys.readouterr().err
     assert "scan.xyz" in words and "a standard deviation must be positive" in words
+    assert "give --control MESH to --symmetry" in words
 
 
 def test_many_scans_get_a_folder_each_and_a_summary_though_one_fails(files, capsys):
