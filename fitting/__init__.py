@@ -2,6 +2,8 @@
 
 from ._align import Alignment as Alignment
 from ._align import align as align
+from ._boundary import BoundaryCurve as BoundaryCurve
+from ._boundary import boundary_of as boundary_of
 from ._cohort import fit_cohort as fit_cohort
 from ._cohort_record import Cohort as Cohort
 from ._control_mesh import control_mesh as control_mesh
@@ -42,3 +44,5 @@ from ._scan import Scan as Scan
 from ._scan import ScanError as ScanError
 from ._scan import read_scan as read_scan
 from ._search import search_closest as search_closest
+from ._symmetry import Symmetry as Symmetry
+from ._symmetry import find_symmetry as find_symmetry

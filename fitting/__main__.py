@@ -22,6 +22,7 @@ from jaxsubdiv._compare import SCHEMES
 from jaxsubdiv._files import replacing
 from jaxsubdiv._warnings import plain_warnings
 
+from ._boundary import BoundaryCurve, boundary_of
 from ._example import Example, example
 from ._fit import CHECKPOINT, Sweep
 from ._fit_scan import CHECKPOINT_START, ScanFit, misfit
@@ -29,6 +30,7 @@ from ._landmarks import Landmarks, match_landmarks, read_landmarks
 from ._page import write_page
 from ._picture import draw_fit, surface_distances
 from ._recipe import Recipe, load_recipe
+from ._residuals import Priors
 from ._result import FitResult
 from ._saved import load
 from ._scan import Scan, read_scan
@@ -55,6 +57,7 @@ class _Job(NamedTuple):
     scan: Scan
     mesh: js.ControlMesh | None
     landmarks: Landmarks | None
+    boundary: BoundaryCurve | None = None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -94,6 +97,8 @@ def _recipe(options: argparse.Namespace) -> Recipe:
     given = {name: value for name, value in (given | {"tolerance_mm": options.tolerance}).items() if value is not None}
     if options.align is not None:
         given["pose"] = None if options.align == "none" else options.align
+    if options.symmetry is not None:
+        given["priors"] = eqx.tree_at(lambda p: p.symmetry, recipe.priors, Priors(symmetry=options.symmetry).symmetry)
     return dataclasses.replace(recipe, scheme=scheme, **given)
 
 
@@ -138,6 +143,7 @@ def _run(scan: Path | None, folder: Path, options: argparse.Namespace, recipe: R
                 job.scan,
                 job.mesh,
                 landmarks=job.landmarks,
+                boundary=job.boundary,
                 on_stage=progress.stage,
                 throw=False,
                 on_sweep=progress.update,
@@ -213,7 +219,14 @@ def _inputs(scan: Path | None, options: argparse.Namespace) -> _Job:
             read_landmarks(options.landmarks, scale=options.scale),
             read_landmarks(options.control_landmarks, scale=options.control_scale),
         )
-    return _Job(scan.name, points, mesh, landmarks)
+    if options.symmetry is not None and mesh is None:
+        raise ValueError("symmetry is that of a template: give --control MESH to --symmetry.")
+    boundary = None
+    if options.boundary == "scan":
+        boundary = BoundaryCurve(boundary_of(js.read_mesh(scan, scale=options.scale, check=False)))
+    elif options.boundary is not None:
+        boundary = BoundaryCurve(js.read_points(options.boundary, scale=options.scale).points)
+    return _Job(scan.name, points, mesh, landmarks, boundary)
 
 
 def _ending(found: ScanFit, off: float) -> str:
@@ -341,6 +354,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--align", choices=("similarity", "rigid", "affine", "none"), help=f"of the template (default: {Recipe.pose})")
     add("--landmarks", metavar="FILE", help="named places on the scan, .json or .csv; the template's in the next")
     add("--control-landmarks", metavar="FILE", help="the same names on the template")
+    add("--symmetry", type=float, metavar="MM", help="keep the fit as symmetric as the template, but for so much")
+    add("--boundary", metavar="FILE", help="points of the curve that the open surface ends at; `scan`: the scan's rim")
     add("--tolerance", type=float, metavar="MM", help="split the control mesh until the surface is this near the scan")
     add("--label", help="only the rows of a .csv whose column `label` or `contour` holds this")
     add("--scale", type=float, default=1.0, help="multiplies the scan's coordinates; 1000 for metres")

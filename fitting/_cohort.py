@@ -125,12 +125,17 @@ def fit_cohort(
 
     Raises:
         ScanError: a scan cannot be fitted; the text names it by its number.
-        ValueError: as in `fit`; or the numbers of scans and controls differ.
+        ValueError: as in `fit`; or the numbers of scans and controls differ, or the priors ask for symmetry.
     """
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
     controls = [controls] * len(scans) if isinstance(controls, js.Control) else list(controls)
     if len(controls) != len(scans) or not scans:
         raise ValueError(f"there are {len(scans)} scans and {len(controls)} controls: give one or more, and one each.")
+    if np.isfinite(priors.symmetry):
+        raise ValueError(
+            "a cohort has no prior of symmetry: its steps do not solve for a mirror plane. Leave `Priors.symmetry` "
+            "out, or call `fit` for each scan."
+        )
     for i, (control, scan) in enumerate(zip(controls, scans, strict=True)):
         try:
             check(scheme, topology, control, scan)

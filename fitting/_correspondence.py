@@ -75,6 +75,15 @@ def nearest_rows(
     return np.reshape(distances, (len(points), k)), np.reshape(rows, (len(points), k))
 
 
+def nearest_on_segments(
+    a: Float[np.ndarray, "s 3"], b: Float[np.ndarray, "s 3"], points: Float[np.ndarray, "p 3"]
+) -> tuple[Int[np.ndarray, "p"], Float[np.ndarray, "p"]]:
+    """The segment from `a` to `b` that is closest to each point, and where on it, 0 to 1."""
+    edge = (b - a).T
+    segment, uv = _nearest_triangle(_Triangles(a.T, edge, edge), points)  # a triangle without area is its edges
+    return segment, uv.sum(axis=1)
+
+
 def _nearest_triangle(
     triangles: _Triangles, points: Float[np.ndarray, "p 3"]
 ) -> tuple[Int[np.ndarray, "p"], Float[np.ndarray, "p 2"]]:

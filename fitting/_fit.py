@@ -17,6 +17,7 @@ import jaxsubdiv as js
 from jaxsubdiv._linalg import dot, unit
 from jaxsubdiv._surface import corner_weights
 
+from ._boundary import BoundaryCurve, checked_curve, held_vertices
 from ._checkpoint import Checkpoint
 from ._correspondence import boundary_vertices, closest_points
 from ._free import Free, apply_offset, edge_length
@@ -28,6 +29,7 @@ from ._residuals import Anchors, Priors
 from ._result import FitResult
 from ._robust import AbstractLoss, geman_mcclure
 from ._scan import Scan, ScanError
+from ._symmetry import Symmetry, find_symmetry, symmetry_of
 
 # A start that is off by more than this part of the control mesh's size is not roughly aligned.
 _FAR = 0.05
@@ -63,6 +65,8 @@ def fit(
     loss: AbstractLoss | None = None,
     landmarks: Landmarks | None = None,
     landmark_deviation: float = 1.0,
+    symmetry: Symmetry | None = None,
+    boundary: BoundaryCurve | None = None,
     max_sweeps: int = 60,
     tolerance: float = 0.1,
     throw: bool = True,
@@ -87,6 +91,10 @@ def fit(
         loss: how a point loses weight with its distance; default: `geman_mcclure()`.
         landmarks: places on the scan and on the control mesh where it starts, which the fit keeps together.
         landmark_deviation: how far they may be apart, as a standard deviation in mm; a weight divides its square.
+        symmetry: the partners that `Priors.symmetry` ties; default, where it is given: those that `find_symmetry` finds
+            on the control mesh where the fit starts.
+        boundary: a curve that the open surface ends at: its boundary follows from the points of the curve, and scan
+            points beyond it do not count.
         max_sweeps: how many sweeps at most.
         tolerance: converged once a sweep, annealed, moves nine tenths of the surface, and the RMS distance, by less
             than this part of the surface's uncertainty, which is about noise / sqrt(points a control vertex); or of a
@@ -100,33 +108,42 @@ def fit(
     Raises:
         UserWarning: the start is so far off that the fit will hardly find its way.
         ScanError: the sizes of scan and control mesh differ as by a wrong unit, or there are too few points.
-        ValueError: the topology has no levels, or does not fit the control; the checkpoint is of another fit.
+        ValueError: the topology has no levels, or does not fit the control; the control mesh has no symmetry, though
+            the priors ask for it; the checkpoint is of another fit.
         RuntimeError: with `throw`, the fit did not converge or met values that are not finite.
     """
     check(scheme, topology, control, scan)
     # Made here and not in the signature: arrays made while a module loads would settle JAX's device and precision.
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
+    symmetry = _partners(symmetry, priors, topology, control)
     control = js.Control(control.vertices, given_normals(topology, control))
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
     settings["landmark_deviation"] = landmark_deviation
     recipe = Recipe.of(scheme, topology, **settings)
     given = {"scheme": scheme, "topology": topology, "control": control, "scan": scan, "landmarks": landmarks}
+    given |= {"symmetry": symmetry, "boundary": boundary}
     kept = None if checkpoint is None else Checkpoint(Path(checkpoint) / CHECKPOINT, given | settings)
     before = None if kept is None else kept.read()
     start = control
     surface = js.refine(scheme, topology, control)
     open_vertices, edge = boundary_vertices(surface), float(edge_length(topology, control.vertices))
+    curve = None if boundary is None else checked_curve(boundary, topology)
+
+    def seen_from(surface: js.RefinedSurface, floor: float) -> Look:
+        held = None if curve is None else held_vertices(curve, surface, edge)
+        return look(surface, scan, open_vertices, around, edge, loss, floor, held)
+
     around = surroundings(scan)
-    seen = look(surface, scan, open_vertices, around, edge, loss, LEAST_NOISE * edge)
+    seen = seen_from(surface, LEAST_NOISE * edge)
     widest = float(seen.scale)  # a robust scale of the start's own error: outliers must not widen it
     _warn_if_far(float(np.median(np.abs(seen.distances))), control)
     rms, robust_rms, result = [float(seen.rms)], [float(seen.robust_rms)], optx.RESULTS.nonlinear_max_steps_reached
     anchors = None if landmarks is None else _anchors(landmarks, landmark_deviation, topology, control, surface)
-    problem = Problem(scheme, topology, control, free, priors, anchors)
+    problem = Problem(scheme, topology, control, free, priors, anchors, symmetry, curve)
     if before is not None:
         scheme, control, rms, robust_rms = _recalled(before, problem, scheme, control, seen)
         surface = js.refine(scheme, topology, control)
-        seen = look(surface, scan, open_vertices, around, edge, loss, _floor(widest, len(rms) - 1, edge))
+        seen = seen_from(surface, _floor(widest, len(rms) - 1, edge))
     for sweep in range(len(rms) - 1, max_sweeps):
         proposed = _apply(topology, scheme, control, problem.step(scheme, control, seen))
         refined = js.refine(proposed[0], topology, proposed[1])
@@ -136,7 +153,7 @@ def fit(
         moved = float(surface_moved(surface, refined))
         (scheme, control), surface = proposed, refined
         floor = _floor(widest, sweep + 1, edge)
-        seen = look(surface, scan, open_vertices, around, edge, loss, floor)
+        seen = seen_from(surface, floor)
         rms.append(float(seen.rms))
         robust_rms.append(float(seen.robust_rms))
         if on_sweep is not None:
@@ -195,6 +212,17 @@ def _recalled(
         scheme = eqx.tree_at(lambda s: s.h, scheme, jnp.asarray(before["h"]))
     control = js.Control(jnp.asarray(before["vertices"]), jnp.asarray(before["normals"]))
     return scheme, control, before["rms"].tolist(), before["robust_rms"].tolist()
+
+
+def _partners(symmetry: Symmetry | None, priors: Priors, topology: js.Topology, control: js.Control) -> Symmetry | None:
+    """Those that the prior ties, where there is one."""
+    if not np.isfinite(priors.symmetry):
+        if symmetry is not None:
+            raise ValueError("`symmetry` says who is whose image; say how near in mm, too: Priors(symmetry=1.0).")
+        return None
+    if symmetry is None:
+        return find_symmetry(js.ControlMesh(control.vertices, topology.control_faces, check=False))
+    return symmetry_of(symmetry.partner, np.asarray(control.vertices))
 
 
 @eqx.filter_jit

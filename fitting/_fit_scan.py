@@ -23,6 +23,7 @@ from ._landmarks import Landmarks
 from ._recipe import Recipe
 from ._result import FitResult
 from ._scan import Scan
+from ._symmetry import Symmetry, find_symmetry
 
 Outcome: TypeAlias = Literal["tolerance met", "noise reached", "no more faces"]
 
@@ -89,7 +90,8 @@ def fit_scan(
         on_stage: told what begins, in a few words.
         checkpoint: a folder from which a call with the same arguments goes on where it was stopped, see `fit`; where
             the fit started is in it too, in `checkpoint_start.npz`.
-        options: of `fit`; or `mesh_normals` and `limit`, of `js.build_topology`.
+        options: of `fit`; or `mesh_normals` and `limit`, of `js.build_topology`. Where `priors` ask for symmetry, the
+            partners are found on the template as it is given.
 
     Raises:
         ScanError, ValueError, ImportError, RuntimeError: as `align`, `control_mesh` and `fit` do.
@@ -119,6 +121,7 @@ def fit_scan(
         start = _Start(alignment.mesh, first, alignment, 0)
     else:
         start = _Start(mesh, first, None, 0)
+    own_partners, priors = options.pop("symmetry", None), options.get("priors")
     while True:
         say(f"fits {len(start.mesh.vertices):,} control vertices")
         # Tables come from the faces alone; normals that would fold the surface are replaced in the fit.
@@ -132,16 +135,29 @@ def fit_scan(
             kept.write(_arrays(start))
         # The landmarks' places were those of the template.
         of_first = _landmarks_there(landmarks, mesh, start) if start.splits == 0 else None
-        result = fit(start.scheme, topology, control, scan, landmarks=of_first, checkpoint=checkpoint, **options)
+        partners = own_partners if start.splits == 0 else None
+        if partners is None and mesh is not None and priors is not None and np.isfinite(priors.symmetry):
+            partners = _partners(mesh, first, start.splits)
+        here = {"landmarks": of_first, "symmetry": partners, "checkpoint": checkpoint}
+        result = fit(start.scheme, topology, control, scan, **here, **options)
         outcome = _outcome(result, start.mesh, tolerance_mm, most_faces)
         if tolerance_mm is None or outcome is not None:
             break
-        start = _Start(_split(result, start.mesh), result.scheme, start.alignment, start.splits + 1)
+        start = _Start(
+            _split(result.scheme, start.mesh, result.control), result.scheme, start.alignment, start.splits + 1
+        )
     if kept is not None:
         kept.remove()
     assert result.recipe is not None
     result.recipe = dataclasses.replace(result.recipe, scheme=first, **settings)
     return ScanFit(result, start.mesh, start.alignment, start.splits, outcome)
+
+
+def _partners(template: js.ControlMesh, scheme: js.AbstractScheme, splits: int) -> Symmetry:
+    """On the template as it is given: an affine pose leaves no mirror plane, and a fit no exact one."""
+    for _ in range(splits):
+        template = _split(scheme, template, template.control(weights=scheme.weights))
+    return find_symmetry(template)
 
 
 def _landmarks_there(landmarks: Landmarks | None, mesh: js.ControlMesh | None, start: _Start) -> Landmarks | None:
@@ -199,13 +215,12 @@ def _outcome(result: FitResult, mesh: js.ControlMesh, tolerance_mm: float | None
     return "no more faces" if too_many else None
 
 
-def _split(result: FitResult, mesh: js.ControlMesh) -> js.ControlMesh:
-    """The fitted control mesh, every face cut in four by the scheme's rule: the same surface, with more to move."""
-    scheme = result.scheme
+def _split(scheme: js.AbstractScheme, mesh: js.ControlMesh, control: js.Control) -> js.ControlMesh:
+    """A control mesh of these faces, each cut in four by the scheme's rule: the same surface, with more to move."""
     if scheme.h is not None and scheme.h.ndim:  # one h a level: what is left of it serves the split mesh
         scheme = dataclasses.replace(scheme, h=scheme.h[:1])
-    fitted = js.ControlMesh(result.control.vertices, mesh.faces, result.control.normals, check=False)
-    finer = js.refine(scheme, js.build_topology(fitted, scheme, 1), result.control)
+    fitted = js.ControlMesh(control.vertices, mesh.faces, control.normals, check=False)
+    finer = js.refine(scheme, js.build_topology(fitted, scheme, 1), control)
     return js.ControlMesh(finer.vertices, finer.faces, finer.normals if scheme.uses_normals else None)
 
 

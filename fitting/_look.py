@@ -83,6 +83,7 @@ def look(
     edge: float,
     loss: AbstractLoss,
     floor: float,
+    held: Bool[np.ndarray, "v"] | None = None,
 ) -> Look:
     """Pair every scan point with the closest point of the surface, and weigh the pairs by how far apart they lie.
 
@@ -92,10 +93,11 @@ def look(
         edge: length of a control edge in mm.
         loss: how a point loses weight with its distance.
         floor: the least scale of the loss in mm.
+        held: vertices of the boundary that lie where they should: points beyond them do not count.
     """
     at = closest_points(surface, np.asarray(scan.points))
     edge_and_floor = (jnp.asarray(value, scan.points.dtype) for value in (edge, floor))
-    return measure(surface, scan, at, open_vertices, around, *edge_and_floor, loss)
+    return measure(surface, scan, at, open_vertices, around, *edge_and_floor, loss, held)
 
 
 @jax.jit
@@ -108,6 +110,7 @@ def measure(
     edge: Float[Array, ""],
     floor: Float[Array, ""],
     loss: AbstractLoss,
+    held: Bool[Array | np.ndarray, "v"] | None = None,
 ) -> Look:
     on, normals = js.evaluate(surface, at)
     away = scan.points - on
@@ -134,6 +137,8 @@ def measure(
     weights = given * loss.weight(own / at_its_scale)
     across = jnp.abs(dot(normals, away))[:, 0]
     goes_on = around.crowded & (distance < edge) & (across < 3 * scale * spread + _STEEPEST * distance)
+    if held is not None:
+        goes_on &= jnp.sum(jnp.where(held[corners], inside, 0.0), axis=1) < 1 - _ON_BOUNDARY
     weights = jnp.where(at_boundary & ~goes_on, 0.0, weights)
     # The derivative of a distance is along it: across the face, or from the edge or boundary that is closest.
     directions = jnp.where(distance[:, None] > edge * _ON_SURFACE, unit(away), normals)

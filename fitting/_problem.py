@@ -12,6 +12,7 @@ from scipy.sparse.linalg import SuperLU, splu
 import jaxsubdiv as js
 from jaxsubdiv._linalg import unit
 
+from ._boundary import BoundaryCurve, pair_with_boundary
 from ._correspondence import AnyArray
 from ._elements import (
     Elements,
@@ -39,6 +40,7 @@ from ._residuals import (
     control_faces_of,
     prior_faces,
 )
+from ._symmetry import Mirror, Symmetry, Ties, mirror_at, ties
 
 # Standard deviation of a step in control edges: what neither scan nor priors hold stays near where it is. A control
 # vertex that turns back is held faster, and one that goes on is let go again: where the surface cannot follow the scan
@@ -63,6 +65,13 @@ class _Equations(NamedTuple):
     gradient: Float[np.ndarray, "n"]
     bends: Float[np.ndarray, "b"]
     by_bend: Float[np.ndarray, "b d"]
+    ties: Ties | None
+    """Of the prior of symmetry, whose rows lie in no control face."""
+
+    @property
+    def tied(self) -> sp.csc_array | None:
+        """Its matrix."""
+        return None if self.ties is None else (self.ties.by.T @ self.ties.by).tocsc()
 
 
 class Found(NamedTuple):
@@ -75,6 +84,8 @@ class Found(NamedTuple):
     determined: float
     annealed: bool
     anchors: Anchors | None
+    symmetry: Symmetry | None = None
+    curve: BoundaryCurve | None = None
 
 
 class Memory(NamedTuple):
@@ -98,8 +109,11 @@ class Problem:
         free: Free,
         priors: Priors,
         anchors: Anchors | None = None,
+        symmetry: Symmetry | None = None,
+        curve: BoundaryCurve | None = None,
     ):
         self._topology, self.free, self._priors, self._anchors = topology, free, priors, anchors
+        self._symmetry, self._curve = symmetry, curve
         self._template = np.asarray(control.vertices, np.float64)
         self._zero = no_offset(free, scheme, control)
         masks = free.of(scheme, len(self._template))
@@ -121,12 +135,17 @@ class Problem:
     def step(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> Unknowns:
         """The most probable offset from here, to first order. It also finds the next strength of the bend prior."""
         found = self._equations(scheme, control, seen)
-        held = factorise(self._matrix(found.data + found.prior, self._hold))
+        tied = found.tied
+        held = factorise(self._matrix(found.data + found.prior, self._hold, tied))
         step = np.zeros(self.elements.n)
         step[self.is_free] = -held.solve(found.gradient[self.is_free])
+        if found.ties is not None:
+            step = found.ties.with_plane(step, held.solve, self.is_free)
         # What is held says nothing of what the scan determines.
         loose = (
-            factorise(self._matrix(found.data + found.prior, self.loose)) if np.any(self._hold > self.loose) else held
+            factorise(self._matrix(found.data + found.prior, self.loose, tied))
+            if np.any(self._hold > self.loose)
+            else held
         )
         self._hold_what_turns_back(step)
         self._count_determined(found.data, loose)
@@ -139,14 +158,14 @@ class Problem:
     def precision_matrix(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> sp.csc_array:
         """Of the free unknowns, about here: the inverse of their covariance."""
         found = self._equations(scheme, control, seen)
-        return self._matrix(found.data + found.prior, self.loose)
+        return self._matrix(found.data + found.prior, self.loose, found.tied)
 
     def _equations(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> _Equations:
         start = self.start(scheme, control)
         face = self._owner[np.asarray(seen.at.face)]
         if self._elements is None:
             self._elements = self._analyse(start, seen, face)
-        elements, faces = self._elements, self._faces
+        elements = self._elements
         data, gradient = np.zeros(elements.pattern.nnz), np.zeros(elements.n)
         rows, by_priors = None, np.zeros((0, 0))
         for part, counts, at in padded(seen.pairs, self.distance_precisions(seen), face):
@@ -158,10 +177,20 @@ class Problem:
         if not len(self._precision):
             # As smooth as the template, to begin with.
             self._set_bend(np.full(len(elements.columns), 1 / max(float(np.mean(np.square(rows.bend))), _TINY)))
-        weights, of_priors = np.concatenate(self.prior_precisions()), np.concatenate(faces)
+        weights, of_priors = np.concatenate(self.prior_precisions()), self._row_faces(start)
         gradient += times_transposed(elements, by_priors, weights * np.concatenate(rows[1:]), of_priors)
         prior = normal_matrix(elements, by_priors, weights, of_priors)
-        return _Equations(data, prior, gradient, np.asarray(rows.bend), by_priors[: len(rows.bend)])
+        mirror = self.mirror(control)
+        tied = None if mirror is None else ties(mirror, control, self._zero)
+        if tied is not None:
+            gradient += tied.by.T @ tied.rows
+        return _Equations(data, prior, gradient, np.asarray(rows.bend), by_priors[: len(rows.bend)], tied)
+
+    def mirror(self, control: js.Control) -> Mirror | None:
+        """The prior of symmetry about here; None where there is none."""
+        if self._symmetry is None:
+            return None
+        return mirror_at(self._symmetry, float(self._priors.symmetry), self._topology, control, self._zero)
 
     def prior_precisions(self) -> Rows:
         """1 / variance of every row of the priors; there are none of distances."""
@@ -173,6 +202,7 @@ class Problem:
             stretch=np.full(len(faces.stretch), stretch),
             margin=np.ones(len(faces.margin)),
             landmark=np.ones(len(faces.landmark)),
+            rim=np.ones(0 if self._curve is None else 2 * len(self._curve.points)),
             h=np.full(len(faces.h), h),
         )
 
@@ -185,7 +215,17 @@ class Problem:
         """The arguments of the residuals, for a sweep that starts here."""
         template = moved_to(self._template, np.asarray(control.vertices, np.float64))
         template = jnp.asarray(template, control.vertices.dtype)
-        return Start(scheme, self._topology, control, template, self._anchors, self._edges, self._bend_edges)
+        rim = None
+        if self._curve is not None:
+            rim = pair_with_boundary(self._curve, js.refine(scheme, self._topology, control))
+        return Start(scheme, self._topology, control, template, self._anchors, self._edges, self._bend_edges, rim)
+
+    def _row_faces(self, start: Start, distance: Int[np.ndarray, "p"] | None = None) -> Int[np.ndarray, "m"]:
+        """The control face of every row, of the distances where there are any."""
+        faces = self._faces if distance is None else self._faces._replace(distance=distance)
+        if start.rim is not None:
+            faces = faces._replace(rim=np.repeat(self._owner[np.asarray(start.rim.face)], 2))
+        return np.concatenate(faces)
 
     def across(
         self, scheme: js.AbstractScheme, control: js.Control
@@ -221,7 +261,7 @@ class Problem:
             found.bends + by @ step[self.is_free],
             by,
             self._faces.bend,
-            factorise(self._matrix(found.prior, self.loose)).solve,
+            factorise(self._matrix(found.prior, self.loose, found.tied)).solve,
             factor.solve,
             self._around,
         )
@@ -257,7 +297,7 @@ class Problem:
         pairs, _, face = next(padded(seen.pairs, np.asarray(seen.precisions), face))
         for rings in range(1, _MOST_RINGS + 1):
             found = find_elements(self._topology, self.free, start, rings)
-            row_faces = np.concatenate(self._faces._replace(distance=face))
+            row_faces = self._row_faces(start, face)
             _, by, along = differentiate(self._zero, start, pairs, found.seeds, found.seeds_of[row_faces])
             if not forgets_some(found, np.asarray(by), row_faces, np.asarray(along)):
                 return found
@@ -269,7 +309,7 @@ class Problem:
     def _differentiate(
         self, start: Start, pairs: Pairs, face: Int[np.ndarray, "p"]
     ) -> tuple[Rows, Float[np.ndarray, "m d"]]:
-        seeds_of = self.elements.seeds_of[np.concatenate(self._faces._replace(distance=face))]
+        seeds_of = self.elements.seeds_of[self._row_faces(start, face)]
         rows, by, _ = differentiate(self._zero, start, pairs, self.elements.seeds, seeds_of)
         return jax.tree.map(lambda values: np.asarray(values, np.float64), (rows, by))
 
@@ -286,7 +326,9 @@ class Problem:
 
     def found(self) -> Found:
         """What a problem made anew has to be told, to know as much as this one."""
-        return Found(self._template, self._precision, self.determined, self.annealed, self._anchors)
+        return Found(
+            self._template, self._precision, self.determined, self.annealed, self._anchors, self._symmetry, self._curve
+        )
 
     def tell(self, found: Found) -> None:
         """Take over what the sweeps of another problem found."""
@@ -301,10 +343,11 @@ class Problem:
         self._elements = self._analyse(self.start(scheme, control), seen, self._owner[np.asarray(seen.at.face)])
         self._precision, self.determined, self.annealed, self._hold, self._last_step = memory
 
-    def _matrix(self, values: np.ndarray, diagonal: np.ndarray) -> sp.csc_array:
+    def _matrix(self, values: np.ndarray, diagonal: np.ndarray, tied: sp.csc_array | None = None) -> sp.csc_array:
         pattern = self.elements.pattern
         whole = sp.csc_array((values, pattern.indices, pattern.indptr), shape=pattern.shape)
         whole = (whole + sp.diags_array(diagonal)).tocsc()
+        whole = whole if tied is None else (whole + tied).tocsc()
         return whole if self.is_free.all() else whole[self.is_free][:, self.is_free].tocsc()
 
     def _trace(self, values: np.ndarray) -> float:

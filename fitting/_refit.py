@@ -16,6 +16,7 @@ from ._elements import to_unknowns
 from ._free import Unknowns, apply_offset, no_offset
 from ._posterior import Posterior
 from ._residuals import Pairs, Rows, Start, residuals
+from ._symmetry import Mirror
 
 _MOST_STEPS = 200
 _TOLERANCE = 1e-8  # of the solution and of its derivative, in posterior standard deviations
@@ -31,6 +32,7 @@ class _Fixed(NamedTuple):
     precisions: Float[Array, "p"]
     prior_precisions: Rows
     hold: Float[Array, "n"]
+    mirror: Mirror | None
     whitening: Float[Array, "n u"]
     """Takes unknowns of variance 1, as the posterior has them, to offsets."""
 
@@ -41,7 +43,8 @@ class Refit(eqx.Module):
 
     Get it from a fit: `refit = result.refit()`. Then `refit(points)` is a smooth function for `jax.grad`, `jax.jvp`,
     `jax.jit` and `jax.vmap`: the control that the fit would find from these points if every point kept its surface
-    point, its direction and its robust weight, and if the noise and the strength of the priors stayed what they were.
+    point, its direction and its robust weight, and if the noise, the strength of the priors and the plane of symmetry
+    stayed what they were.
 
     The derivative is that of the solution, not of the steps to it: of the volume of a fitted organ, say, by each of the
     scan points that it came from.
@@ -96,9 +99,13 @@ def _cost(
     z: Float[Array, "u"], points: Float[Array, "p 3"], weights: Float[Array, "p"], fixed: _Fixed
 ) -> Float[Array, ""]:
     vector = fixed.whitening @ z
-    rows = residuals(to_unknowns(vector, fixed.zero), fixed.start, fixed.pairs._replace(points=points))
+    offset, start = to_unknowns(vector, fixed.zero), fixed.start
+    rows = residuals(offset, start, fixed.pairs._replace(points=points))
     precisions = fixed.prior_precisions._replace(distance=fixed.precisions * weights)
     terms = [jnp.sum(precision * row**2) for precision, row in zip(precisions, rows, strict=True)]
+    if fixed.mirror is not None:
+        _, control = apply_offset(start.topology, start.scheme, start.control, offset)
+        terms.append(jnp.sum(fixed.mirror.rows(control, jnp) ** 2))
     return 0.5 * (jnp.sum(jnp.stack(terms)) + jnp.sum(fixed.hold * vector**2))
 
 
@@ -121,6 +128,7 @@ def make_refit(posterior: Posterior) -> Refit:
     def on_device(values: object) -> Array:
         return jnp.asarray(values, dtype)
 
+    mirror = problem.mirror(posterior.control)
     return Refit(
         _Fixed(
             start=problem.start(posterior.scheme, posterior.control),
@@ -129,6 +137,7 @@ def make_refit(posterior: Posterior) -> Refit:
             precisions=on_device(problem.distance_precisions(posterior.seen)),
             prior_precisions=Rows(*map(on_device, problem.prior_precisions())),
             hold=on_device(problem.loose),
+            mirror=jax.tree.map(lambda a: on_device(a) if a.dtype.kind == "f" else a, mirror),
             whitening=on_device(whitening),
         )
     )

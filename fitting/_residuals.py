@@ -19,6 +19,7 @@ from jaxsubdiv._half_edges import HalfEdges, half_edges
 from jaxsubdiv._linalg import cross, dot, norm, take, unit
 from jaxsubdiv._surface import sum_corners
 
+from ._boundary import Rim
 from ._free import Unknowns, apply_offset, edge_length
 
 # A normal that leans less than this, as a cosine, from the faces around it keeps the surface smooth; it may be a little
@@ -44,6 +45,9 @@ class Priors(eqx.Module):
         stretch: of the change of a control edge along the surface, against the control mesh where the fit starts, as a
             part of the edge's length. It keeps the control vertices in their places where the scan does not.
         h: of the tangent length coefficient about 1.
+        symmetry: of the departure of a control vertex from the mirror image of its partner in mm, in each coordinate;
+            of control normals, by as much as they move the surface. Default: left out. The mirror plane moves along
+            with the mesh; `fit` finds the partners, or is given them (see `find_symmetry`).
 
     Raises:
         ValueError: a standard deviation is not positive.
@@ -54,6 +58,7 @@ class Priors(eqx.Module):
     )
     stretch: Float[Array, ""] = eqx.field(converter=_positive, default=0.2)
     h: Float[Array, ""] = eqx.field(converter=_positive, default=0.05)
+    symmetry: Float[Array, ""] = eqx.field(converter=_positive, default=np.inf)
 
 
 class Pairs(NamedTuple):
@@ -92,6 +97,7 @@ class Start(NamedTuple):
     """Control edges."""
     bend_edges: Int[Array | np.ndarray, "b 2"]
     """Edges of which the bends are compared."""
+    rim: Rim | None = None
 
 
 class Rows(NamedTuple):
@@ -105,6 +111,8 @@ class Rows(NamedTuple):
     """One a corner of the control faces, over its own standard deviation."""
     landmark: Float[Array | np.ndarray, "l"]
     """Three a landmark, over its standard deviation."""
+    rim: Float[Array | np.ndarray, "r"]
+    """Two a point of the boundary curve, over its standard deviation."""
     h: Float[Array | np.ndarray, "n"]
     """h - 1."""
 
@@ -122,6 +130,7 @@ def residuals(offset: Unknowns, start: Start, pairs: Pairs) -> Rows:
         stretch=_stretch(start, control),
         margin=_margin_rows(start.topology, control) if scheme.uses_normals else none,
         landmark=none if start.anchors is None else _anchor_rows(start.anchors, surface),
+        rim=none if start.rim is None else start.rim.rows(surface.vertices),
         h=none if offset.h is None else jnp.atleast_1d(scheme.h).astype(dtype) - 1,
     )
 
@@ -206,6 +215,8 @@ class RowFaces(NamedTuple):
     stretch: Int[np.ndarray, "s"]
     margin: Int[np.ndarray, "c"]
     landmark: Int[np.ndarray, "l"]
+    rim: Int[np.ndarray, "r"]
+    """None yet: every sweep pairs the boundary anew."""
     h: Int[np.ndarray, "n"]
 
 
@@ -232,6 +243,7 @@ def prior_faces(
         stretch=np.repeat(of_edge, 3),
         margin=np.concatenate(corners) if scheme.uses_normals else np.zeros(0, int),
         landmark=np.zeros(0, int) if anchors is None else np.repeat(owner[np.asarray(anchors.face)], 3),
+        rim=np.zeros(0, int),
         h=np.zeros(n_h, int),
     )
 

@@ -15,12 +15,14 @@ import jaxsubdiv as js
 from jaxsubdiv._files import replacing
 from jaxsubdiv._surface import corner_weights
 
+from ._boundary import BoundaryCurve
 from ._look import Look
 from ._problem import Found, Problem
 from ._recipe import Recipe
 from ._residuals import Anchors, Pairs
 from ._result import FitResult
 from ._scan import Scan
+from ._symmetry import symmetry_of
 
 _VERSION = 1
 _FIT, _RECIPE = "fit.npz", "recipe.json"
@@ -67,6 +69,10 @@ def save(folder: str | os.PathLike[str], result: FitResult) -> None:
     optional = {"h": result.scheme.h} | {f"scan_{name}": value for name, value in vars(scan).items()}
     if found.anchors is not None:
         optional |= {f"anchor_{name}": value for name, value in found.anchors._asdict().items()}
+    if found.symmetry is not None:
+        optional |= {"symmetry_partner": found.symmetry.partner}
+    if found.curve is not None:
+        optional |= {"boundary_points": found.curve.points, "boundary_deviation": found.curve.deviation}
     arrays |= {name: value for name, value in optional.items() if value is not None}
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -147,7 +153,13 @@ def _restored(arrays: dict[str, np.ndarray]) -> FitResult:
     anchors = None
     if "anchor_points" in arrays:
         anchors = Anchors(*(on_device(f"anchor_{name}") for name in Anchors._fields))
-    problem = Problem(recipe.scheme, topology, start, recipe.free, recipe.priors, anchors)
+    symmetry = None
+    if "symmetry_partner" in arrays:
+        symmetry = symmetry_of(arrays["symmetry_partner"], arrays["template"])
+    curve = None
+    if "boundary_points" in arrays:
+        curve = BoundaryCurve(arrays["boundary_points"], float(arrays["boundary_deviation"]))
+    problem = Problem(recipe.scheme, topology, start, recipe.free, recipe.priors, anchors, symmetry, curve)
     kept = (float(arrays["determined"]), bool(arrays["annealed"]))
     problem.tell(Found(arrays["template"], arrays["bend_precision"], *kept, anchors))
     return FitResult(
