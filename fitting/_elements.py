@@ -19,10 +19,11 @@ from jaxtyping import Array, Float, Int, Shaped
 import jaxsubdiv as js
 
 from ._free import Free, Unknowns, no_offset
-from ._residuals import Pairs, Rows, Start, residuals
+from ._residuals import Pairs, Rows, Start, signed_distances, surface_and_priors
 
 _ROWS_A_BLOCK = 32
 _PAIRS_AT_ONCE = 65_536  # bounds the memory to a few hundred MB, however large the scan is
+_PATCHES_AT_ONCE = 512  # likewise
 _WRONG = 1e-3  # of a derivative: far more than rounding in float32, far less than a forgotten control vertex
 
 
@@ -43,11 +44,42 @@ class Elements(NamedTuple):
     """Number of unknowns."""
 
 
-class Derivatives(NamedTuple):
-    """Rows and their derivatives by the unknowns of the face that each lies in."""
+class Patches(NamedTuple):
+    """The part of the surface that belongs to each control face."""
 
-    values: Float[np.ndarray, "m"]
-    by: Float[np.ndarray, "m d"]
+    owner: Int[np.ndarray, "g"]
+    """The control face of every face of the surface."""
+    vertices: Int[np.ndarray, "f w"]
+    """The vertices of each patch; 0 where there are fewer than in others."""
+    slots: Int[np.ndarray, "g 4"]
+    """Where in its patch each corner of a face of the surface stands; corners as `corner_weights` has them."""
+
+
+class Derivatives(NamedTuple):
+    """Values at the start of a sweep, and their derivatives by the unknowns of the control faces that they lie in."""
+
+    surface: Float[Array, "v 3"]
+    rows: Rows
+    """Of the priors."""
+    by_rows: Float[Array, "m d"]
+    by_surface: Float[Array, "f w d 3"]
+    """Of the vertices of the patches."""
+    along: tuple[Float[Array, "v 3"], Float[Array, "m"]]
+    """Of all vertices, and of the rows, along the last seed."""
+
+
+def find_patches(surface: js.RefinedSurface, owner: Int[np.ndarray, "g"], n_control_faces: int) -> Patches:
+    """The patches of a surface, from the control face of each of its faces."""
+    triangles, quads = (np.asarray(surface.faces[size]) for size in (3, 4))
+    corners = np.concatenate([np.concatenate([triangles, triangles[:, 2:]], axis=1), quads])
+    n = surface.vertices.shape[0]
+    keys, place = np.unique(owner[:, None].astype(np.int64) * n + corners, return_inverse=True)
+    of_key = keys // n
+    counts = np.bincount(of_key, minlength=n_control_faces)
+    slot = np.arange(len(keys)) - (np.cumsum(counts) - counts)[of_key]
+    vertices = np.zeros((n_control_faces, counts.max()), np.int32)
+    vertices[of_key, slot] = keys % n
+    return Patches(owner, vertices, slot[place].reshape(corners.shape).astype(np.int32))
 
 
 def find_elements(topology: js.Topology, free: Free, start: Start, rings: int) -> Elements:
@@ -102,21 +134,56 @@ def to_unknowns(row: Float[Array, "n"], like: Unknowns) -> Unknowns:
 
 @eqx.filter_jit
 def differentiate(
-    zero: Unknowns, start: Start, pairs: Pairs, seeds: Unknowns, seeds_of: Int[Array | np.ndarray, "m d"]
-) -> tuple[Rows, Float[Array, "m d"], Float[Array, "m"]]:
-    """Rows at the start, their derivatives by the unknowns of their faces, and those along the last seed."""
-    rows, derivative = jax.linearize(lambda offset: residuals(offset, start, pairs), zero)
-    along = jax.lax.map(lambda seed: jnp.concatenate(derivative(seed)), seeds)
-    return rows, jnp.take_along_axis(along.T, seeds_of, axis=1), along[-1]
+    zero: Unknowns,
+    start: Start,
+    seeds: Unknowns,
+    seeds_of: Int[Array | np.ndarray, "f d"],
+    row_faces: Int[Array | np.ndarray, "m"],
+    patches: Int[Array | np.ndarray, "f w"],
+) -> Derivatives:
+    """The surface and the rows of the priors at the start of a sweep, and their derivatives.
+
+    Args:
+        seeds: see `Elements`; so is `seeds_of`.
+        row_faces: the control face of every row.
+        patches: the vertices of the surface over every control face.
+    """
+    (surface, rows), derivative = jax.linearize(lambda offset: surface_and_priors(offset, start), zero)
+
+    def along(seed: Unknowns) -> tuple[Array, Array]:
+        by_surface, by_rows = derivative(seed)
+        return by_surface, jnp.concatenate(by_rows)
+
+    of_surface, of_rows = jax.lax.map(along, seeds)
+    by_rows = jnp.take_along_axis(of_rows.T, seeds_of[row_faces], axis=1)
+    by_surface = of_surface[seeds_of[:, None, :], patches[:, :, None]]
+    return Derivatives(surface, rows, by_rows, by_surface, (of_surface[-1], of_rows[-1]))
 
 
-def forgets_some(
-    elements: Elements, by: Float[np.ndarray, "m d"], face: Int[np.ndarray, "m"], along: np.ndarray
-) -> bool:
-    """Whether rows depend on unknowns that the elements do not know of: seen in the derivative along the last seed."""
-    seed = np.append(flat(jax.tree.map(lambda rows: rows[-1], elements.seeds)), 0.0)
-    by_elements = np.einsum("md,md->m", by, seed[elements.columns[face]])
-    return bool(np.abs(by_elements - along).max() > _WRONG * np.abs(along).max())
+@jax.jit
+def differentiate_distances(
+    found: Derivatives, pairs: Pairs, face: Int[Array | np.ndarray, "p"], slots: Int[Array | np.ndarray, "p 4"]
+) -> tuple[Float[Array, "p"], Float[Array, "p d"]]:
+    """Distances from the surface, and their derivatives.
+
+    Args:
+        face: the control face of each pair.
+        slots: where in its patch each of the corners stands.
+    """
+    factors = pairs.corner_weights[:, :, None] * pairs.directions[:, None, :]
+    a, b, c, d = (jnp.einsum("pdx,px->pd", found.by_surface[face, slots[:, i]], factors[:, i]) for i in range(4))
+    return signed_distances(found.surface, pairs), (a + b) + (c + d)
+
+
+def forgets_some(elements: Elements, patches: Patches, found: Derivatives, row_faces: Int[np.ndarray, "m"]) -> bool:
+    """Whether values depend on unknowns that the elements do not know: seen in the derivative along the last seed."""
+    seed = np.append(flat(jax.tree.map(lambda rows: rows[-1], elements.seeds)), 0.0)[elements.columns]
+    of_surface, of_rows = (np.asarray(part) for part in found.along)
+    by_surface = np.einsum("fwdx,fd->fwx", np.asarray(found.by_surface), seed)
+    corners = patches.owner[:, None], patches.slots
+    surface = by_surface[corners] - of_surface[patches.vertices[corners]]
+    rows = np.einsum("md,md->m", np.asarray(found.by_rows), seed[row_faces]) - of_rows
+    return any(np.abs(off).max() > _WRONG * np.abs(of).max() for off, of in ((surface, of_surface), (rows, of_rows)))
 
 
 def flat(unknowns: Unknowns) -> Shaped[np.ndarray, "n"]:
@@ -140,9 +207,57 @@ def normal_matrix(
     inside = place < (first + counts)[owner][:, None]
     rows = order[np.where(inside, place, 0)]
     scaled = by[rows] * (np.sqrt(weights)[rows] * inside)[..., None]
-    products = np.matmul(scaled.transpose(0, 2, 1), scaled)
-    sums = np.bincount(elements.places[owner].ravel(), products.ravel(), minlength=elements.pattern.nnz + 1)
+    return _summed(elements, owner, np.matmul(scaled.transpose(0, 2, 1), scaled))
+
+
+def _summed(
+    elements: Elements, face: Int[np.ndarray, "b"] | slice, products: Float[np.ndarray, "b d d"]
+) -> Float[np.ndarray, "_"]:
+    """Sums of matrices, a control face each, in the pattern of the elements."""
+    sums = np.bincount(elements.places[face].ravel(), products.ravel(), minlength=elements.pattern.nnz + 1)
     return sums[:-1]
+
+
+def equations_of_many(
+    elements: Elements,
+    patches: Patches,
+    found: Derivatives,
+    pairs: Pairs,
+    weights: Float[np.ndarray, "p"],
+    at: Int[np.ndarray, "p"],
+) -> tuple[Float[np.ndarray, "_"], Float[np.ndarray, "n"]]:
+    """J' W J and J' W times the distances, of more pairs than the patches have vertices.
+
+    A distance depends on three or four vertices of the surface. What the pairs of a patch say of its vertices is summed
+    up first, and then taken to the unknowns, once a patch and not once a pair.
+
+    Args:
+        at: the face of the surface of each pair.
+    """
+    distances = np.asarray(jax.jit(signed_distances)(found.surface, pairs), np.float64)
+    corner_weights, directions = (np.asarray(part, np.float64) for part in (pairs.corner_weights, pairs.directions))
+    face, width = patches.owner[at], 3 * patches.vertices.shape[1]
+    order, (n_faces, d) = np.argsort(face, kind="stable"), elements.columns.shape
+    values, gradient = np.zeros(elements.pattern.nnz), np.zeros(elements.n + 1)
+    for first in range(0, n_faces, _PATCHES_AT_ONCE):
+        those = slice(first, min(first + _PATCHES_AT_ONCE, n_faces))
+        n = those.stop - first
+        rows = order[slice(*np.searchsorted(face, (first, those.stop), sorter=order))]
+        factors = (corner_weights[rows, :, None] * directions[rows, None, :]).reshape(-1, 12)
+        coordinate = (3 * patches.slots[at[rows], :, None] + np.arange(3)).reshape(-1, 12)
+        place = (face[rows, None] - first) * width + coordinate
+        weighted = factors * weights[rows, None]
+        sides = np.bincount(place.ravel(), (weighted * distances[rows, None]).ravel(), n * width)
+        inner = np.bincount(
+            (place[:, :, None] * width + coordinate[:, None, :]).ravel(),
+            (weighted[:, :, None] * factors[:, None, :]).ravel(),
+            n * width * width,
+        ).reshape(n, width, width)
+        by = np.asarray(found.by_surface[those], np.float64).transpose(0, 1, 3, 2).reshape(n, width, d)
+        values += _summed(elements, those, np.matmul(by.transpose(0, 2, 1), np.matmul(inner, by)))
+        by_unknowns = np.matmul(sides.reshape(n, 1, width), by)
+        gradient += np.bincount(elements.columns[those].ravel(), by_unknowns.ravel(), elements.n + 1)
+    return values, gradient[:-1]
 
 
 def times_transposed(

@@ -141,7 +141,7 @@ def fit(
     anchors = None if landmarks is None else _anchors(landmarks, landmark_deviation, topology, control, surface)
     problem = Problem(scheme, topology, control, free, priors, anchors, symmetry, curve)
     if before is not None:
-        scheme, control, rms, robust_rms = _recalled(before, problem, scheme, control, seen)
+        scheme, control, rms, robust_rms = _recalled(before, problem, scheme, control)
         surface = js.refine(scheme, topology, control)
         seen = seen_from(surface, _floor(widest, len(rms) - 1, edge))
     for sweep in range(len(rms) - 1, max_sweeps):
@@ -202,12 +202,12 @@ def _floor(widest: float, sweep: int, edge: float) -> float:
 
 
 def _recalled(
-    before: dict[str, np.ndarray], problem: Problem, scheme: js.AbstractScheme, control: js.Control, seen: Look
+    before: dict[str, np.ndarray], problem: Problem, scheme: js.AbstractScheme, control: js.Control
 ) -> tuple[js.AbstractScheme, js.Control, list[float], list[float]]:
     """Scheme, control and RMS distances of a fit that was stopped; its problem takes up what it knew."""
     memory = Memory._make(before[name] for name in Memory._fields)
     memory = memory._replace(determined=float(memory.determined), annealed=bool(memory.annealed))
-    problem.recall(memory, scheme, control, seen)
+    problem.recall(memory, scheme, control)
     if scheme.h is not None:
         scheme = eqx.tree_at(lambda s: s.h, scheme, jnp.asarray(before["h"]))
     control = js.Control(jnp.asarray(before["vertices"]), jnp.asarray(before["normals"]))

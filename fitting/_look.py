@@ -13,7 +13,7 @@ from jaxsubdiv._linalg import dot, norm, unit
 from jaxsubdiv._surface import corner_weights
 
 from ._correspondence import closest_points, nearest_rows
-from ._outliers import dense_points, scattered_points
+from ._outliers import NEIGHBOURS, is_dense, scattered_points
 from ._residuals import Pairs
 from ._robust import AbstractLoss, noise_scale
 from ._scan import Scan
@@ -65,13 +65,13 @@ def surroundings(scan: Scan) -> Surroundings:
     counted = np.flatnonzero(np.asarray(scan.weights_or_ones()) > 0)  # the others are as if they were not there
     points = np.asarray(scan.points)[counted]
     crowded, scattered = np.zeros((2, scan.n_points), bool)
-    crowded[counted] = dense_points(points)
-    scattered[counted] = scattered_points(points, crowded[counted])
-    neighbours = np.zeros((scan.n_points, 1), np.int32)
-    if len(counted) > 1:
-        _, rows = nearest_rows(KDTree(points), points, min(_NEIGHBOURS + 1, len(points)))
-        neighbours = np.zeros((scan.n_points, rows.shape[1] - 1), np.int32)
-        neighbours[counted] = counted[rows[:, 1:]]
+    neighbours = np.zeros((scan.n_points, min(_NEIGHBOURS, max(len(counted) - 1, 1))), np.int32)
+    if len(counted):
+        distances, rows = nearest_rows(KDTree(points), points, min(NEIGHBOURS + 1, len(points)))
+        crowded[counted] = is_dense(distances[:, -1])
+        scattered[counted] = scattered_points(points, crowded[counted])
+        if len(counted) > 1:
+            neighbours[counted] = counted[rows[:, 1 : _NEIGHBOURS + 1]]
     return Surroundings(crowded, scattered, crowded & (crowded.sum() > _CLEAN * len(counted)), neighbours)
 
 

@@ -6,7 +6,7 @@ from scipy.spatial import KDTree
 
 from ._correspondence import nearest_rows
 
-_NEIGHBOURS = 10
+NEIGHBOURS = 10
 # 95 % and more of the points in a ball have neighbours so thick, of the sparse points of a hand-traced head 7 %.
 _AROUND, _THICK = 16, 1 / 3
 _LOW = 0.2  # with 60 % of outliers a third of the surface's own points still lies below this quantile
@@ -21,9 +21,13 @@ def dense_points(points: Float[np.ndarray, "p 3"], spread: float = 1.7) -> Bool[
             surface of even density that distance varies by a fifth; scattered points have theirs twice as far, even
             where they are most of the scan.
     """
-    if len(points) <= 2 * _NEIGHBOURS:
-        return np.ones(len(points), bool)
-    distance = neighbour_distance(points)
+    return is_dense(neighbour_distance(points), spread)
+
+
+def is_dense(distance: Float[np.ndarray, "p"], spread: float = 1.7) -> Bool[np.ndarray, "p"]:
+    """The same of points whose distances to their tenth neighbours are known."""
+    if len(distance) <= 2 * NEIGHBOURS:
+        return np.ones(len(distance), bool)
     return distance <= spread * max(np.quantile(distance, _LOW), np.finfo(float).tiny)
 
 
@@ -44,7 +48,7 @@ def scattered_points(points: Float[np.ndarray, "p 3"], dense: Bool[np.ndarray, "
     return scattered
 
 
-def neighbour_distance(points: Float[np.ndarray, "p 3"], k: int = _NEIGHBOURS) -> Float[np.ndarray, "p"]:
+def neighbour_distance(points: Float[np.ndarray, "p 3"], k: int = NEIGHBOURS) -> Float[np.ndarray, "p"]:
     """Distance of every point to its `k`-th neighbour, in the unit of the points."""
     return nearest_rows(KDTree(points), points, min(k + 1, len(points)))[0][:, -1]
 

@@ -15,9 +15,13 @@ from jaxsubdiv._linalg import unit
 from ._boundary import BoundaryCurve, pair_with_boundary
 from ._correspondence import AnyArray
 from ._elements import (
+    Derivatives,
     Elements,
     differentiate,
+    differentiate_distances,
+    equations_of_many,
     find_elements,
+    find_patches,
     flat,
     forgets_some,
     jacobian,
@@ -119,8 +123,10 @@ class Problem:
         masks = free.of(scheme, len(self._template))
         self.is_free = flat(masks).astype(bool)
         # A surface of any shape: only to tell which face lies where.
-        self._owner = control_faces_of(topology, js.refine(scheme, topology, control), control)
-        self._faces = prior_faces(scheme, topology, anchors, self._owner, 0 if masks.h is None else masks.h.size)
+        surface = js.refine(scheme, topology, control)
+        owner = control_faces_of(topology, surface, control)
+        self._patches = find_patches(surface, owner, sum(map(len, topology.control_faces.values())))
+        self._faces = prior_faces(scheme, topology, anchors, owner, 0 if masks.h is None else masks.h.size)
         self._edges, self._bend_edges = control_edges(topology), bend_edges(topology)
         self._around = neighbourhoods(topology)
         self._edge = float(edge_length(topology, control.vertices))
@@ -162,18 +168,11 @@ class Problem:
 
     def _equations(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> _Equations:
         start = self.start(scheme, control)
-        face = self._owner[np.asarray(seen.at.face)]
         if self._elements is None:
-            self._elements = self._analyse(start, seen, face)
-        elements = self._elements
-        data, gradient = np.zeros(elements.pattern.nnz), np.zeros(elements.n)
-        rows, by_priors = None, np.zeros((0, 0))
-        for part, counts, at in padded(seen.pairs, self.distance_precisions(seen), face):
-            rows, by = self._differentiate(start, part, at)
-            by_distance, by_priors = np.split(by, [len(at)])
-            data += normal_matrix(elements, by_distance, counts, at)
-            gradient += times_transposed(elements, by_distance, counts * np.asarray(rows.distance), at)
-        assert rows is not None  # a scan has points
+            self._elements = self._analyse(start)
+        elements, found = self._elements, self._differentiate(start)
+        data, gradient = self._of_distances(found, seen)
+        rows, by_priors = jax.tree.map(lambda values: np.asarray(values, np.float64), (found.rows, found.by_rows))
         if not len(self._precision):
             # As smooth as the template, to begin with.
             self._set_bend(np.full(len(elements.columns), 1 / max(float(np.mean(np.square(rows.bend))), _TINY)))
@@ -220,30 +219,23 @@ class Problem:
             rim = pair_with_boundary(self._curve, js.refine(scheme, self._topology, control))
         return Start(scheme, self._topology, control, template, self._anchors, self._edges, self._bend_edges, rim)
 
-    def _row_faces(self, start: Start, distance: Int[np.ndarray, "p"] | None = None) -> Int[np.ndarray, "m"]:
-        """The control face of every row, of the distances where there are any."""
-        faces = self._faces if distance is None else self._faces._replace(distance=distance)
+    def _row_faces(self, start: Start) -> Int[np.ndarray, "m"]:
+        """The control face of every row of the priors."""
+        faces = self._faces
         if start.rim is not None:
-            faces = faces._replace(rim=np.repeat(self._owner[np.asarray(start.rim.face)], 2))
+            faces = faces._replace(rim=np.repeat(self._patches.owner[np.asarray(start.rim.face)], 2))
         return np.concatenate(faces)
 
     def across(
         self, scheme: js.AbstractScheme, control: js.Control
     ) -> tuple[Int[np.ndarray, "w"], Float[np.ndarray, "w d"]]:
         """How the vertices of the surface move along their normals: the control face of each, and the derivatives."""
-        surface = js.refine(scheme, self._topology, control)
-        n = surface.vertices.shape[0]
-        face = np.zeros(n, np.int64)
-        before = 0
-        for size in (3, 4):
-            corners = np.asarray(surface.faces[size])
-            face[corners] = self._owner[before : before + len(corners), None]
-            before += len(corners)
-        itself = jnp.tile(jnp.eye(1, 4, dtype=surface.vertices.dtype), (n, 1))
-        pairs = Pairs(surface.vertices, jnp.repeat(jnp.arange(n)[:, None], 4, axis=1), itself, surface.normals)
-        start = self.start(scheme, control)
-        parts = [self._differentiate(start, part, at)[1][: len(at)] for part, _, at in padded(pairs, np.ones(n), face)]
-        return face, np.concatenate(parts)[:n]
+        surface, patches = js.refine(scheme, self._topology, control), self._patches
+        face, slot = np.zeros((2, surface.vertices.shape[0]), np.int64)
+        corners = patches.vertices[patches.owner[:, None], patches.slots]
+        face[corners], slot[corners] = patches.owner[:, None], patches.slots
+        by_surface = np.asarray(self._differentiate(self.start(scheme, control)).by_surface, np.float64)
+        return face, np.einsum("vdx,vx->vd", by_surface[face, slot], np.asarray(surface.normals, np.float64))
 
     def across_control(self, control: js.Control) -> tuple[Int[np.ndarray, "v 3"], Float[np.ndarray, "v 3"]]:
         """How the control vertices move along their normals: the unknowns of each, and the derivatives."""
@@ -292,26 +284,42 @@ class Problem:
             self._precision = np.maximum(self._precision, given)
             self.annealed = bool((self._precision <= given).all())
 
-    def _analyse(self, start: Start, seen: Look, face: Int[np.ndarray, "p"]) -> Elements:
+    def _analyse(self, start: Start) -> Elements:
         """Which unknowns belong to which face: as few rings of faces as explain all derivatives."""
-        pairs, _, face = next(padded(seen.pairs, np.asarray(seen.precisions), face))
         for rings in range(1, _MOST_RINGS + 1):
-            found = find_elements(self._topology, self.free, start, rings)
-            row_faces = self._row_faces(start, face)
-            _, by, along = differentiate(self._zero, start, pairs, found.seeds, found.seeds_of[row_faces])
-            if not forgets_some(found, np.asarray(by), row_faces, np.asarray(along)):
-                return found
+            self._elements = find_elements(self._topology, self.free, start, rings)
+            found = self._differentiate(start)
+            if not forgets_some(self._elements, self._patches, found, self._row_faces(start)):
+                return self._elements
         raise ValueError(
             f"a face of {type(start.scheme).__name__} depends on control vertices more than {_MOST_RINGS} rings of "
             "faces away: the fit has no sparse derivatives to work with."
         )
 
-    def _differentiate(
-        self, start: Start, pairs: Pairs, face: Int[np.ndarray, "p"]
-    ) -> tuple[Rows, Float[np.ndarray, "m d"]]:
-        seeds_of = self.elements.seeds_of[self._row_faces(start, face)]
-        rows, by, _ = differentiate(self._zero, start, pairs, self.elements.seeds, seeds_of)
-        return jax.tree.map(lambda values: np.asarray(values, np.float64), (rows, by))
+    def _differentiate(self, start: Start) -> Derivatives:
+        elements, faces = self.elements, self._row_faces(start)
+        return differentiate(self._zero, start, elements.seeds, elements.seeds_of, faces, self._patches.vertices)
+
+    def _of_distances(self, found: Derivatives, seen: Look) -> tuple[Float[np.ndarray, "_"], Float[np.ndarray, "n"]]:
+        """The scan's matrix, in the pattern of the elements, and its gradient."""
+        elements, patches = self.elements, self._patches
+        of_pairs = seen.pairs, self.distance_precisions(seen), np.asarray(seen.at.face)
+        if len(of_pairs[-1]) > patches.vertices.size:
+            return equations_of_many(elements, patches, found, *of_pairs)
+        data, gradient = np.zeros(elements.pattern.nnz), np.zeros(elements.n)
+        for pairs, weights, at in padded(*of_pairs):
+            distances, by, face = self._differentiate_distances(found, pairs, at)
+            data += normal_matrix(elements, by, weights, face)
+            gradient += times_transposed(elements, by, weights * distances, face)
+        return data, gradient
+
+    def _differentiate_distances(
+        self, found: Derivatives, pairs: Pairs, at: Int[np.ndarray, "p"]
+    ) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p d"], Int[np.ndarray, "p"]]:
+        """Distances, derivatives and control faces of pairs on these faces of the surface."""
+        face = self._patches.owner[at]
+        distances, by = differentiate_distances(found, pairs, face, self._patches.slots[at])
+        return np.asarray(distances, np.float64), np.asarray(by, np.float64), face
 
     @property
     def elements(self) -> Elements:
@@ -338,9 +346,9 @@ class Problem:
         """What `recall` needs, to go on from here."""
         return Memory(self._precision, self.determined, self.annealed, self._hold, self._last_step)
 
-    def recall(self, memory: Memory, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> None:
+    def recall(self, memory: Memory, scheme: js.AbstractScheme, control: js.Control) -> None:
         """Go on where another problem was, that made its first step from this scheme and control."""
-        self._elements = self._analyse(self.start(scheme, control), seen, self._owner[np.asarray(seen.at.face)])
+        self._elements = self._analyse(self.start(scheme, control))
         self._precision, self.determined, self.annealed, self._hold, self._last_step = memory
 
     def _matrix(self, values: np.ndarray, diagonal: np.ndarray, tied: sp.csc_array | None = None) -> sp.csc_array:

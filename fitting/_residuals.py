@@ -119,13 +119,24 @@ class Rows(NamedTuple):
 
 def residuals(offset: Unknowns, start: Start, pairs: Pairs) -> Rows:
     """All rows at an offset from the start; no distances, so that a perfect fit has a derivative too."""
+    vertices, rows = surface_and_priors(offset, start)
+    return rows._replace(distance=signed_distances(vertices, pairs))
+
+
+def signed_distances(vertices: Float[Array, "v 3"], pairs: Pairs) -> Float[Array, "p"]:
+    """How far the surface points lie from their scan points, along the directions held fixed."""
+    away = sum_corners(vertices, pairs.corners, pairs.corner_weights) - pairs.points
+    return dot(pairs.directions, away)[:, 0]
+
+
+def surface_and_priors(offset: Unknowns, start: Start) -> tuple[Float[Array, "v 3"], Rows]:
+    """The surface's vertices and the rows of the priors at an offset from the start."""
     scheme, control = apply_offset(start.topology, start.scheme, start.control, offset)
     surface = js.refine(scheme, start.topology, control)
-    away = sum_corners(surface.vertices, pairs.corners, pairs.corner_weights) - pairs.points
     dtype = surface.vertices.dtype
     none = jnp.zeros((0,), dtype)
-    return Rows(
-        distance=dot(pairs.directions, away)[:, 0],
+    return surface.vertices, Rows(
+        distance=none,
         bend=_bends(start, scheme, control, surface),
         stretch=_stretch(start, control),
         margin=_margin_rows(start.topology, control) if scheme.uses_normals else none,

@@ -14,7 +14,17 @@ from schemes import MIXED, control_mesh, random_control
 import fitting
 import jaxsubdiv as js
 from fitting import Free, Priors, Scan, _elements, _posterior, _refit
-from fitting._elements import differentiate, find_elements, flat, forgets_some, jacobian, normal_matrix, to_unknowns
+from fitting._elements import (
+    differentiate,
+    differentiate_distances,
+    find_elements,
+    find_patches,
+    flat,
+    forgets_some,
+    jacobian,
+    normal_matrix,
+    to_unknowns,
+)
 from fitting._evidence import neighbourhoods, next_precision
 from fitting._free import no_offset
 from fitting._residuals import Pairs, Start, bend_edges, control_edges, control_faces_of, prior_faces, residuals
@@ -43,7 +53,8 @@ def mixed_rows(kind: str, levels: int):
     start = Start(scheme, topology, control, jnp.asarray(mesh.vertices), None, *edges)
     zero = no_offset(free, scheme, control)
     owner = control_faces_of(topology, surface, control)
-    faces = prior_faces(scheme, topology, None, owner, zero.h.size)._replace(distance=owner[face])
+    faces = prior_faces(scheme, topology, None, owner, zero.h.size)
+    patches = find_patches(surface, owner, mesh.n_faces)
 
     @jax.jit
     def in_full(start, pairs):
@@ -52,38 +63,54 @@ def mixed_rows(kind: str, levels: int):
 
         return jax.jacfwd(of_vector)(jnp.zeros(flat(zero).size))
 
-    return start, pairs, zero, np.concatenate(faces), np.asarray(in_full(start, pairs))
+    return start, pairs, zero, face, patches, np.concatenate(faces), np.asarray(in_full(start, pairs))
+
+
+def by_elements(kind: str, levels: int, rings: int):
+    start, pairs, zero, at, patches, of_priors, in_full = mixed_rows(kind, levels)
+    elements = find_elements(start.topology, Free(), start, rings)
+    tables = elements.seeds, elements.seeds_of, of_priors, patches.vertices
+    return elements, differentiate(zero, start, *tables), pairs, at, patches, of_priors, in_full
 
 
 @pytest.mark.parametrize(("kind", "levels"), [("default", 2), ("h a level", 2), ("circle", 1)])
 def test_derivatives_by_elements_are_those_in_full(kind, levels):
-    start, pairs, zero, face, in_full = mixed_rows(kind, levels)
-    elements = find_elements(start.topology, Free(), start, rings=1)
-    _, by, along = differentiate(zero, start, pairs, elements.seeds, elements.seeds_of[face])
-    assert not forgets_some(elements, np.asarray(by), face, np.asarray(along))
-    np.testing.assert_allclose(jacobian(elements, np.asarray(by), face).toarray(), in_full, atol=1e-12)
+    elements, found, pairs, at, patches, of_priors, in_full = by_elements(kind, levels, rings=1)
+    assert not forgets_some(elements, patches, found, of_priors)
+    face = np.append(patches.owner[at], of_priors)
+    distances, by = differentiate_distances(found, pairs, face[: len(at)], patches.slots[at])
+    np.testing.assert_allclose(distances, -0.1, atol=1e-12)
+    by = np.concatenate([by, found.by_rows])
+    np.testing.assert_allclose(jacobian(elements, by, face).toarray(), in_full, atol=1e-12)
     # Far fewer derivatives than unknowns: that is what the colours are for.
-    assert elements.seeds.vertices.shape[0] < 0.75 * flat(zero).size
+    assert elements.seeds.vertices.shape[0] < 0.75 * in_full.shape[1]
+
+    def matrix(values):
+        pattern = elements.pattern
+        return sp.csc_array((values, pattern.indices, pattern.indptr), shape=pattern.shape).toarray()
 
     weights = np.random.default_rng(2).uniform(0.5, 2, len(face))
-    values = normal_matrix(elements, np.asarray(by), weights, face)
-    pattern = elements.pattern
-    found = sp.csc_array((values, pattern.indices, pattern.indptr), shape=pattern.shape).toarray()
-    np.testing.assert_allclose(found, in_full.T @ (weights[:, None] * in_full), atol=1e-10)
     np.testing.assert_allclose(
-        _elements.times_transposed(elements, np.asarray(by), weights, face), in_full.T @ weights, atol=1e-10
+        matrix(normal_matrix(elements, by, weights, face)), in_full.T @ (weights[:, None] * in_full), atol=1e-10
     )
+    np.testing.assert_allclose(_elements.times_transposed(elements, by, weights, face), in_full.T @ weights, atol=1e-10)
+    # Summed up a patch at a time, as it is done where there are many pairs.
+    of_pairs, weights = in_full[: len(at)], weights[: len(at)]
+    for patches_at_once in (512, 5):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(_elements, "_PATCHES_AT_ONCE", patches_at_once)
+            values, gradient = _elements.equations_of_many(elements, patches, found, pairs, weights, at)
+        np.testing.assert_allclose(matrix(values), of_pairs.T @ (weights[:, None] * of_pairs), atol=1e-10)
+        np.testing.assert_allclose(gradient, of_pairs.T @ (-0.1 * weights), atol=1e-10)
 
 
 def test_elements_that_are_too_small_are_noticed():
-    start, pairs, zero, face, _ = mixed_rows("default", 2)
-    elements = find_elements(start.topology, Free(), start, rings=0)
-    _, by, along = differentiate(zero, start, pairs, elements.seeds, elements.seeds_of[face])
-    assert forgets_some(elements, np.asarray(by), face, np.asarray(along))
+    elements, found, _, _, patches, of_priors, _ = by_elements("default", 2, rings=0)
+    assert forgets_some(elements, patches, found, of_priors)
 
 
 def test_vectors_of_unknowns_go_to_offsets_and_back():
-    start, _, zero, _, _ = mixed_rows("h a level", 2)
+    start, _, zero, *_ = mixed_rows("h a level", 2)
     vector = np.arange(flat(zero).size, dtype=float)
     np.testing.assert_array_equal(flat(to_unknowns(jnp.asarray(vector), zero)), vector)
     for free in (Free(normals=False), Free(vertices=False), Free(True, True, False), Free(False, False, True)):

@@ -49,9 +49,8 @@ def main() -> None:
     off = js.evaluate(found.surface, fitting.closest_points(found.surface, truth)).points - truth
     print(f"{given.points:,} points, {len(mesh.vertices):,} control vertices, {found.report().n_unknowns:,} unknowns")
     print(f"fitted in {time.perf_counter() - began:.0f} s, {len(found.rms) - 1} sweeps, {found.report().reason}")
-    print(
-        f"noise {found.noise:.3f} mm (drawn {SIGMA}); off the truth by {np.sqrt((off**2).sum(axis=1).mean()):.3f} mm RMS"
-    )
+    rms = np.sqrt((off**2).sum(axis=1).mean())
+    print(f"noise {found.noise:.3f} mm (drawn {SIGMA}); off the truth by {rms:.3f} mm RMS")
     print(f"most memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.1f} GB")  # in kB on Linux
 
 
