@@ -25,7 +25,7 @@ from ._elements import (
     times_transposed,
     to_unknowns,
 )
-from ._evidence import neighbourhoods, next_precision
+from ._evidence import Solve, neighbourhoods, next_precision
 from ._free import Free, Unknowns, edge_length, no_offset
 from ._look import Look
 from ._residuals import (
@@ -39,6 +39,7 @@ from ._residuals import (
     control_faces_of,
     prior_faces,
 )
+from ._shifts import Border, Shifts, border_of
 
 # Standard deviation of a step in control edges: what neither scan nor priors hold stays near where it is. A control
 # vertex that turns back is held faster, and one that goes on is let go again: where the surface cannot follow the scan
@@ -51,6 +52,7 @@ _PROBES = 16  # random vectors of a trace
 _MOST_RINGS = 3
 _TINY = np.finfo(float).tiny
 _BENDS = 1.0, 1e-5  # most and least bend asymmetry that is looked for, in control edges
+_FARTHEST = 1e3  # mm: standard deviation of a shift without a prior, so that a slice without weight has an equation
 
 
 class _Equations(NamedTuple):
@@ -63,6 +65,8 @@ class _Equations(NamedTuple):
     gradient: Float[np.ndarray, "n"]
     bends: Float[np.ndarray, "b"]
     by_bend: Float[np.ndarray, "b d"]
+    border: Border | None
+    """Of the shifts, where slices may move."""
 
 
 class Found(NamedTuple):
@@ -118,42 +122,63 @@ class Problem:
         self.annealed = False
         self.determined = 0.0
 
-    def step(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> Unknowns:
-        """The most probable offset from here, to first order. It also finds the next strength of the bend prior."""
-        found = self._equations(scheme, control, seen)
-        held = factorise(self._matrix(found.data + found.prior, self._hold))
-        step = np.zeros(self.elements.n)
-        step[self.is_free] = -held.solve(found.gradient[self.is_free])
+    def step(
+        self, scheme: js.AbstractScheme, control: js.Control, seen: Look, shifts: Shifts | None = None
+    ) -> tuple[Unknowns, Shifts | None]:
+        """The most probable offset from here, to first order, and the shifts of slices together with it.
+
+        It also finds the next strength of the bend prior.
+        """
+        found = self._equations(scheme, control, seen, shifts)
+        held = factorise(self._whole(found, self._hold, 0.0 if shifts is None else np.repeat(shifts.hold, 2)))
+        n, step = int(self.is_free.sum()), np.zeros(self.elements.n)
+        of_shifts = np.zeros(0) if found.border is None else found.border.gradient
+        sides = np.zeros(held.shape[0])
+        sides[: n + len(of_shifts)] = np.append(found.gradient[self.is_free], of_shifts)
+        solution = -held.solve(sides)
+        step[self.is_free] = solution[:n]
+        if shifts is not None:
+            within = solution[n : n + len(of_shifts)].reshape(-1, 2)
+            shifts = self._hold_what_shifts_back(shifts, within)
         # What is held says nothing of what the scan determines.
-        loose = (
-            factorise(self._matrix(found.data + found.prior, self.loose)) if np.any(self._hold > self.loose) else held
-        )
+        slack = shifts is None and not np.any(self._hold > self.loose)
+        loose = held if slack else factorise(self._whole(found, self.loose))
         self._hold_what_turns_back(step)
-        self._count_determined(found.data, loose)
+        self._count_determined(found, loose)
         if self._priors.bend is None:
             self._find_bend(found, step, loose)
         else:
             self._set_bend(self._precision * SOFTER)
-        return to_unknowns(jnp.asarray(step), self._zero)
+        return to_unknowns(jnp.asarray(step), self._zero), shifts
 
-    def precision_matrix(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> sp.csc_array:
-        """Of the free unknowns, about here: the inverse of their covariance."""
-        found = self._equations(scheme, control, seen)
-        return self._matrix(found.data + found.prior, self.loose)
+    def precision_matrix(
+        self, scheme: js.AbstractScheme, control: js.Control, seen: Look, shifts: Shifts | None = None
+    ) -> sp.csc_array:
+        """Of the free unknowns about here, and after them of what `Border` adds: the inverse of their covariance."""
+        return self._whole(self._equations(scheme, control, seen, shifts), self.loose)
 
-    def _equations(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> _Equations:
+    def _equations(
+        self, scheme: js.AbstractScheme, control: js.Control, seen: Look, shifts: Shifts | None
+    ) -> _Equations:
         start = self.start(scheme, control)
         face = self._owner[np.asarray(seen.at.face)]
         if self._elements is None:
             self._elements = self._analyse(start, seen, face)
         elements, faces = self._elements, self._faces
         data, gradient = np.zeros(elements.pattern.nnz), np.zeros(elements.n)
-        rows, by_priors = None, np.zeros((0, 0))
+        rows, by_priors, border, first = None, np.zeros((0, 0)), None, 0
+        by_shifts = None if shifts is None else shifts.derivatives(seen.pairs.directions)
         for part, counts, at in padded(seen.pairs, self.distance_precisions(seen), face):
             rows, by = self._differentiate(start, part, at)
             by_distance, by_priors = np.split(by, [len(at)])
             data += normal_matrix(elements, by_distance, counts, at)
             gradient += times_transposed(elements, by_distance, counts * np.asarray(rows.distance), at)
+            if by_shifts is not None:
+                points = np.minimum(np.arange(first, first + len(at)), len(face) - 1)  # the rows of `padded`
+                by_unknowns = jacobian(elements, by_distance, at)
+                this = border_of(by_unknowns, sp.csr_array(by_shifts[points, :]), counts, np.asarray(rows.distance))
+                border = this if border is None else border.plus(this)
+                first += len(at)
         assert rows is not None  # a scan has points
         if not len(self._precision):
             # As smooth as the template, to begin with.
@@ -161,7 +186,11 @@ class Problem:
         weights, of_priors = np.concatenate(self.prior_precisions()), np.concatenate(faces)
         gradient += times_transposed(elements, by_priors, weights * np.concatenate(rows[1:]), of_priors)
         prior = normal_matrix(elements, by_priors, weights, of_priors)
-        return _Equations(data, prior, gradient, np.asarray(rows.bend), by_priors[: len(rows.bend)])
+        if shifts is not None and border is not None:
+            of_prior = self._shift_precision * shifts.within.ravel()
+            across = sp.csr_array(border.across[self.is_free, :])
+            border = border._replace(across=across, gradient=border.gradient + of_prior)
+        return _Equations(data, prior, gradient, np.asarray(rows.bend), by_priors[: len(rows.bend)], border)
 
     def prior_precisions(self) -> Rows:
         """1 / variance of every row of the priors; there are none of distances."""
@@ -222,17 +251,22 @@ class Problem:
             by,
             self._faces.bend,
             factorise(self._matrix(found.prior, self.loose)).solve,
-            factor.solve,
+            _first_part_of(factor),  # what the scan says of the bends, not knowing how its slices are shifted
             self._around,
         )
         before = self._precision
         self._set_bend(next_one)
         self.annealed = bool(np.abs(np.log(self._precision / before)).mean() < _SETTLED)
 
-    def _count_determined(self, data: Float[np.ndarray, "_"], factor: SuperLU) -> None:
+    def _count_determined(self, found: _Equations, factor: SuperLU) -> None:
         """The trace of the scan's part of the posterior, by random vectors."""
-        probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(int(self.is_free.sum()), _PROBES))
-        of_data = self._matrix(data, np.zeros(len(self.is_free)))
+        probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(factor.shape[0], _PROBES))
+        of_data = self._matrix(found.data, np.zeros(len(self.is_free)))
+        of_data = (
+            of_data
+            if found.border is None
+            else found.border.around(of_data, 0.0, np.zeros((int(self.is_free.sum()), 3)), 0.0)
+        )
         self.determined = max(float(np.mean(np.sum(probes * factor.solve(of_data @ probes), axis=0))), 0.0)
 
     def _hold_what_turns_back(self, step: Float[np.ndarray, "n"]) -> None:
@@ -243,6 +277,12 @@ class Problem:
         factor[:n] = np.repeat(np.where(agree < 0, HOLD, LET_GO), width)
         self._hold = np.clip(self._hold * factor, self.loose, FASTEST * self.loose)
         self._last_step = step
+
+    def _hold_what_shifts_back(self, shifts: Shifts, step: Float[np.ndarray, "s 2"]) -> Shifts:
+        back = np.sum(step * shifts.step, axis=1) < 0
+        loosest = self._shift_precision
+        hold = np.clip(shifts.hold * np.where(back, HOLD, LET_GO), loosest, FASTEST * loosest)
+        return shifts._replace(within=shifts.within + step, step=step, hold=hold)
 
     def _set_bend(self, precision: Float[np.ndarray, "f"]) -> None:
         """The strength found; or the one that the priors ask for, or a stiffer one while it anneals."""
@@ -301,6 +341,25 @@ class Problem:
         self._elements = self._analyse(self.start(scheme, control), seen, self._owner[np.asarray(seen.at.face)])
         self._precision, self.determined, self.annealed, self._hold, self._last_step = memory
 
+    @property
+    def _shift_precision(self) -> float:
+        return min(float(self._priors.shift), _FARTHEST) ** -2
+
+    def _whole(
+        self, found: _Equations, hold: Float[np.ndarray, "n"], hold_shifts: float | Float[np.ndarray, "k"] = 0.0
+    ) -> sp.csc_array:
+        """Of scan and priors; where slices may move, bordered, see `Border`."""
+        matrix = self._matrix(found.data + found.prior, hold)
+        if found.border is None:
+            return matrix
+        of_vertices, normals = np.zeros((len(hold), 3)), self._zero.normals
+        if self._zero.vertices is not None:
+            at = (3 if normals is None else 5) * np.arange(len(self._template))
+            for axis in range(3):
+                of_vertices[at + axis, axis] = hold[at + axis]
+        precision = self._shift_precision + hold_shifts
+        return found.border.around(matrix, precision, of_vertices[self.is_free], self._edge**-2)
+
     def _matrix(self, values: np.ndarray, diagonal: np.ndarray) -> sp.csc_array:
         pattern = self.elements.pattern
         whole = sp.csc_array((values, pattern.indices, pattern.indptr), shape=pattern.shape)
@@ -314,6 +373,17 @@ class Problem:
 def factorise(matrix: sp.csc_array) -> SuperLU:
     # Symmetric and positive definite: no pivoting, and an ordering for symmetric patterns.
     return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+def _first_part_of(factor: SuperLU) -> Solve:
+    """Solves with the inverse's block of the first unknowns: the covariance of them alone."""
+
+    def solve(sides: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+        whole = np.zeros((factor.shape[0], sides.shape[1]))
+        whole[: len(sides)] = sides
+        return factor.solve(whole)[: len(sides)]
+
+    return solve
 
 
 def moved_to(template: AnyArray, vertices: AnyArray, xp: Any = np, *, scale: bool = True) -> AnyArray:

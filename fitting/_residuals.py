@@ -44,6 +44,7 @@ class Priors(eqx.Module):
         stretch: of the change of a control edge along the surface, against the control mesh where the fit starts, as a
             part of the edge's length. It keeps the control vertices in their places where the scan does not.
         h: of the tangent length coefficient about 1.
+        shift: of how far breathing displaced a slice of the scan, in mm, along each of two axes of the slice's plane.
 
     Raises:
         ValueError: a standard deviation is not positive.
@@ -54,6 +55,7 @@ class Priors(eqx.Module):
     )
     stretch: Float[Array, ""] = eqx.field(converter=_positive, default=0.2)
     h: Float[Array, ""] = eqx.field(converter=_positive, default=0.05)
+    shift: Float[Array, ""] = eqx.field(converter=_positive, default=3.0)
 
 
 class Pairs(NamedTuple):
