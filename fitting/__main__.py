@@ -66,6 +66,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.control and not options.scans:
         parser.error("a control mesh needs a scan to be fitted to: give SCAN to --control")
+    if options.labels and not options.scans:
+        parser.error("labels are those of a scan: give SCAN before --labels, which takes all the words that follow")
     _keep_what_serves_again()
     with plain_warnings():
         try:
@@ -129,7 +131,8 @@ def _run(scan: Path | None, folder: Path, options: argparse.Namespace, recipe: R
     began = time.perf_counter()
     try:
         job = _inputs(scan, options)
-        print(f"scan     {job.scan.n_points:,} points, {_size(np.asarray(job.scan.points))}")
+        slices = "" if job.scan.slices is None else f" in {len(np.unique(job.scan.slices))} slices"
+        print(f"scan     {job.scan.n_points:,} points{slices}, {_size(np.asarray(job.scan.points))}")
         done = _done(folder, job.scan, recipe) if options.resume else None
         if done is not None:
             print(f"done     before, in {folder}")
@@ -206,7 +209,7 @@ def _inputs(scan: Path | None, options: argparse.Namespace) -> _Job:
         points, mesh = example(options.example)
         noise = np.random.default_rng(0).normal(scale=_EXAMPLE_NOISE, size=mesh.vertices.shape)
         return _Job(options.example, points, js.ControlMesh(mesh.vertices + noise, mesh.faces, mesh.normals), None)
-    points = read_scan(scan, scale=options.scale, label=options.label)
+    points = read_scan(scan, scale=options.scale, labels=options.labels)
     mesh = None if options.control is None else js.read_mesh(options.control, scale=options.control_scale)
     landmarks = None
     if (options.landmarks is None) != (options.control_landmarks is None) or (options.landmarks and mesh is None):
@@ -357,14 +360,16 @@ def _parser() -> argparse.ArgumentParser:
     add("--symmetry", type=float, metavar="MM", help="keep the fit as symmetric as the template, but for so much")
     add("--boundary", metavar="FILE", help="points of the curve that the open surface ends at; `scan`: the scan's rim")
     add("--tolerance", type=float, metavar="MM", help="split the control mesh until the surface is this near the scan")
-    add("--label", help="only the rows of a .csv whose column `label` or `contour` holds this")
+    add("--labels", nargs="+", metavar="WORD", default=[], help="only rows of a table whose label holds one of these")
     add("--scale", type=float, default=1.0, help="multiplies the scan's coordinates; 1000 for metres")
     add("--control-scale", type=float, default=1.0, help="multiplies the control mesh's coordinates")
     add("--levels", type=int, help=f"levels of refinement, 1 to 8 (default: {Recipe.levels})")
     add("--scheme", choices=tuple(SCHEMES), help="default: interpolating")
     add("--h", type=float, help="tangent length coefficient at the start, for schemes that have one (default: 1)")
     add("--max-sweeps", type=int, help=f"pairing and solving in turns (default: {Recipe.max_sweeps})")
-    add("--recipe", metavar="FILE", help="recipe.json of a fit: its settings; files, --scale and --label are not in it")
+    add(
+        "--recipe", metavar="FILE", help="recipe.json of a fit: its settings; files, --scale and --labels are not in it"
+    )
     add("--resume", action="store_true", help="skip the scans that OUT has with the same points and settings")
     add("--example", choices=get_args(Example), default="head_fragment", help="which, without SCAN")
     return parser

@@ -124,7 +124,7 @@ def fit_cohort(
         UserWarning: some fits did not converge; it names them, and `Cohort.converged` has them.
 
     Raises:
-        ScanError: a scan cannot be fitted; the text names it by its number.
+        ScanError: a scan cannot be fitted, or has slices that are free to move; the text names it by its number.
         ValueError: as in `fit`; or the numbers of scans and controls differ, or the priors ask for symmetry.
     """
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
@@ -139,6 +139,11 @@ def fit_cohort(
     for i, (control, scan) in enumerate(zip(controls, scans, strict=True)):
         try:
             check(scheme, topology, control, scan)
+            if scan.slices is not None and free.shifts:
+                raise ScanError(
+                    "it has slices, which a cohort does not shift. Give `free=Free(shifts=False)` to fit it as it is, "
+                    "or fit it alone with `fit` and give the `points` of its result."
+                )
         except ScanError as error:
             raise ScanError(f"scan {i}: {error}") from error
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
@@ -223,6 +228,7 @@ def _stacked(controls: list[js.Control], scans: Sequence[Scan], at_once: int) ->
             None if scan.normals is None else filled(scan.normals),
             filled(scan.weights_or_ones(), mode="constant"),
             jnp.pad(scan.relative_deviations(), (0, size - scan.n_points), constant_values=1),
+            None,  # slices, which do not move
         )
         whole = eqx.tree_at(lambda s: tuple(vars(s).values()), scan, filled_up, is_leaf=lambda leaf: leaf is None)
         around = around._replace(neighbours=np.asarray(around.neighbours, np.int32))

@@ -65,7 +65,8 @@ class Cohort:
         scheme = recipe.scheme if self.h is None else eqx.tree_at(lambda s: s.h, recipe.scheme, self.h[i])
         edge = float(edge_length(topology, control.vertices))
         open_vertices = boundary_vertices(surface)
-        seen = look(surface, scan, open_vertices, surroundings(scan), edge, recipe.loss, LEAST_NOISE * edge)
+        floor = LEAST_NOISE * edge
+        seen = look(surface, scan.without_slices(), open_vertices, surroundings(scan), edge, recipe.loss, floor)
         problem = Problem(recipe.scheme, topology, start, recipe.free, recipe.priors)
         problem.tell(self._problem.found()._replace(template=np.asarray(start.vertices, np.float64)))
         counted, ends = slice(None, int(self.sweeps[i]) + 1), optx.RESULTS

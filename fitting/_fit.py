@@ -29,6 +29,7 @@ from ._residuals import Anchors, Priors
 from ._result import FitResult
 from ._robust import AbstractLoss, geman_mcclure
 from ._scan import Scan, ScanError
+from ._shifts import find_shifts
 from ._symmetry import Symmetry, find_symmetry, symmetry_of
 
 # A start that is off by more than this part of the control mesh's size is not roughly aligned.
@@ -81,6 +82,10 @@ def fit(
     (graduated non-convexity), so that a start that is far off is not taken for outliers. How smooth the surface is
     follows from the scan, unless the priors say it.
 
+    Where the scan has slices, as of cine MRI, each is shifted within its plane to where it fits the surface and its
+    neighbours best: once the scale of the loss has fallen to the noise, the shifts are found together with the surface.
+    Where that lies as a whole is known from the slices' mean place, as far as `Priors.shift` says.
+
     Args:
         scheme: the scheme; its h is where the fit starts.
         topology: tables of the control mesh, of one level or more.
@@ -129,42 +134,53 @@ def fit(
     open_vertices, edge = boundary_vertices(surface), float(edge_length(topology, control.vertices))
     curve = None if boundary is None else checked_curve(boundary, topology)
 
-    def seen_from(surface: js.RefinedSurface, floor: float) -> Look:
+    def seen_from(surface: js.RefinedSurface, here: Scan, floor: float) -> Look:
         held = None if curve is None else held_vertices(curve, surface, edge)
-        return look(surface, scan, open_vertices, around, edge, loss, floor, held)
+        return look(surface, here, open_vertices, around, edge, loss, floor, held)
 
-    around = surroundings(scan)
-    seen = seen_from(surface, LEAST_NOISE * edge)
+    here, around = scan.without_slices(), surroundings(scan)
+    seen = seen_from(surface, here, LEAST_NOISE * edge)
     widest = float(seen.scale)  # a robust scale of the start's own error: outliers must not widen it
     _warn_if_far(float(np.median(np.abs(seen.distances))), control)
     rms, robust_rms, result = [float(seen.rms)], [float(seen.robust_rms)], optx.RESULTS.nonlinear_max_steps_reached
     anchors = None if landmarks is None else _anchors(landmarks, landmark_deviation, topology, control, surface)
     problem = Problem(scheme, topology, control, free, priors, anchors, symmetry, curve)
+    waiting, shifts = find_shifts(scan) if free.shifts else None, None
     if before is not None:
         scheme, control, rms, robust_rms = _recalled(before, problem, scheme, control)
+        if waiting is not None and "within" in before:
+            waiting, shifts = None, waiting.recalled(before)
+            here = shifts.put_on(scan)
         surface = js.refine(scheme, topology, control)
-        seen = seen_from(surface, _floor(widest, len(rms) - 1, edge))
+        seen = seen_from(surface, here, _floor(widest, len(rms) - 1, edge))
     for sweep in range(len(rms) - 1, max_sweeps):
-        proposed = _apply(topology, scheme, control, problem.step(scheme, control, seen))
+        step, shifted = problem.step(scheme, control, seen, shifts)
+        proposed = _apply(topology, scheme, control, step)
         refined = js.refine(proposed[0], topology, proposed[1])
         if not np.isfinite(refined.vertices).all():
             result = optx.RESULTS.nonfinite  # what the last sound sweep found is what comes back
             break
         moved = float(surface_moved(surface, refined))
-        (scheme, control), surface = proposed, refined
+        (scheme, control), surface, shifts = proposed, refined, shifted
         floor = _floor(widest, sweep + 1, edge)
-        seen = seen_from(surface, floor)
+        here = here if shifts is None else shifts.put_on(scan)
+        seen = seen_from(surface, here, floor)
         rms.append(float(seen.rms))
         robust_rms.append(float(seen.robust_rms))
         if on_sweep is not None:
             on_sweep(Sweep(sweep + 1, robust_rms[-1], moved))
-        annealed = problem.annealed and floor <= seen.scale
+        annealed = problem.annealed and floor <= seen.scale and waiting is None
         at_rest = tolerance * max(_uncertainty(seen, control), AT_REST * edge)
         if annealed and max(moved, abs(robust_rms[-1] - robust_rms[-2])) <= at_rest:
             result = optx.RESULTS.successful
             break
+        if waiting is not None and floor <= seen.scale:
+            # Not before, where the start is off and everything would be taken for shifts; nor when the surface has come
+            # to rest, for it has bent to the slices that are off.
+            waiting, shifts = None, waiting
         if kept is not None:
             now = {"vertices": control.vertices, "normals": control.normals, "h": scheme.h}
+            now |= {} if shifts is None else shifts.memory()
             kept.write(now | {"rms": rms, "robust_rms": robust_rms} | problem.memory()._asdict())
     if kept is not None:
         kept.remove()
@@ -184,6 +200,7 @@ def fit(
         seen=seen,
         recipe=recipe,
         start=start,
+        shifts=shifts,
     )
     if throw and result != optx.RESULTS.successful:
         raise RuntimeError(

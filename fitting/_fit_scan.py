@@ -194,7 +194,7 @@ def misfit(result: FitResult) -> float:
     they share. The square of this is the mean product of the signed distances of each inlier and the one next to it.
     """
     inliers = result.inliers
-    points, distances = np.asarray(result.scan.points)[inliers], result.distances[inliers]
+    points, distances = result.points[inliers], result.distances[inliers]
     if len(points) < 2:
         return 0.0
     _, nearest = nearest_rows(KDTree(points), points, 2)

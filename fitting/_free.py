@@ -16,6 +16,7 @@ class Free(eqx.Module):
         vertices: the control vertices: all, none, or those where a mask `[v]` is True.
         normals: the directions of the control normals, likewise.
         h: the tangent length coefficient, one or one a level, as the scheme has it.
+        shifts: the slices of the scan, where it has any (`Scan.slices`), each within its plane.
 
     What a scheme does not have, or does not look at, is not free.
 
@@ -26,6 +27,7 @@ class Free(eqx.Module):
     vertices: bool | Bool[np.ndarray, "v"] = eqx.field(default=True)
     normals: bool | Bool[np.ndarray, "v"] = eqx.field(default=True)
     h: bool = eqx.field(default=True)
+    shifts: bool = eqx.field(default=True)
 
     def __check_init__(self):
         for name, mask in (("vertices", self.vertices), ("normals", self.normals)):

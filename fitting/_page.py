@@ -85,7 +85,7 @@ def _data(
         "distance": {"values": _floats(distances), "limit": _limit(np.abs(result.distances))},
         "deviation": None if deviation is None else {"values": _floats(deviation), "limit": _limit(deviation)},
         "points": {
-            "vertices": _floats(np.asarray(result.scan.points)[some]),
+            "vertices": _floats(result.points[some]),
             "values": _floats(result.distances[some]),
         },
         "control": {

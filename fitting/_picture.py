@@ -56,7 +56,7 @@ def draw_fit(result: FitResult, start: js.ControlMesh, *, title: str = "") -> "F
     ):
         js.draw_surface(ax, js.ControlMesh(vertices, start.faces, check=False), view=view, edges=True)
         ax.set_title(name)
-    points = np.asarray(result.scan.points) @ view.T
+    points = result.points @ view.T
     before.scatter(*points[:, :2].T, s=0.4, c="tab:blue", linewidths=0, zorder=3)
     js.draw_surface(smooth, surface, view=view)
     smooth.set_title(f"its surface, {surface.n_faces:,} faces")
@@ -71,7 +71,7 @@ def surface_distances(result: FitResult) -> Float[np.ndarray, "v"]:
 
     NaN farther from the scan than its points are from one another, many times over: there is nothing to tell there.
     """
-    points, vertices = np.asarray(result.scan.points), np.asarray(result.surface.vertices)
+    points, vertices = result.points, np.asarray(result.surface.vertices)
     tree = KDTree(points)
     spacing = np.median(nearest_rows(tree, points, min(2, len(points)))[0][:, -1])
     away, nearest = nearest_rows(tree, vertices, min(_NEAREST, len(points)))

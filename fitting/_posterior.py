@@ -15,6 +15,7 @@ import jaxsubdiv as js
 
 from ._look import Look
 from ._problem import Problem, factorise
+from ._shifts import Shifts
 
 _DENSE = 4000  # unknowns whose covariance is kept whole, in 130 MB
 _DRAWS = 200
@@ -33,9 +34,18 @@ class Uncertainty(NamedTuple):
 class Posterior:
     """The surfaces that the scan and the priors leave probable: a Gaussian about the fit, to first order."""
 
-    def __init__(self, problem: Problem, scheme: js.AbstractScheme, control: js.Control, seen: Look):
-        self.problem, self.scheme, self.control, self.seen = problem, scheme, control, seen
-        self.matrix = problem.precision_matrix(scheme, control, seen)
+    def __init__(
+        self,
+        problem: Problem,
+        scheme: js.AbstractScheme,
+        control: js.Control,
+        seen: Look,
+        shifts: Shifts | None = None,
+    ):
+        self.problem, self.scheme, self.control, self.seen, self.shifts = problem, scheme, control, seen, shifts
+        self.matrix = problem.precision_matrix(scheme, control, seen, shifts)
+        """Of the free unknowns, of which there are `n_free`, and after them of what shifts of slices add."""
+        self.n_free = int(problem.is_free.sum())
 
     def uncertainty(self) -> Uncertainty:
         """Exact for up to a few thousand unknowns; beyond, from random draws, to about 5 %."""
@@ -53,7 +63,7 @@ class Posterior:
         exact = free.sum() <= _DENSE
         if exact:
             covariance = np.zeros((n + 1, n + 1))
-            covariance[np.ix_(free, free)] = np.linalg.inv(self.matrix.toarray())
+            covariance[np.ix_(free, free)] = np.linalg.inv(self.matrix.toarray())[: self.n_free, : self.n_free]
         else:
             draws = np.append(self.draws(_DRAWS), np.zeros((1, _DRAWS)), axis=0)
 
@@ -73,9 +83,9 @@ class Posterior:
         """Random offsets of the unknowns, as probable as the posterior has them."""
         factor = factorise(self.matrix)
         # Without pivoting L U is L D L': P' L sqrt(D) z has the covariance A, and its solution that of A's inverse.
-        normal = np.random.default_rng(seed).normal(size=(int(self.problem.is_free.sum()), n))
+        normal = np.random.default_rng(seed).normal(size=(factor.shape[0], n))
         sides = np.empty_like(normal)
         sides[:] = (factor.L @ (np.sqrt(factor.U.diagonal())[:, None] * normal))[factor.perm_r]
         offsets = np.zeros((self.problem.elements.n, n))
-        offsets[self.problem.is_free] = factor.solve(sides)
+        offsets[self.problem.is_free] = factor.solve(sides)[: self.n_free]
         return offsets

@@ -30,7 +30,7 @@ from ._elements import (
     times_transposed,
     to_unknowns,
 )
-from ._evidence import neighbourhoods, next_precision
+from ._evidence import Solve, neighbourhoods, next_precision
 from ._free import Free, Unknowns, edge_length, no_offset
 from ._look import Look
 from ._residuals import (
@@ -44,6 +44,7 @@ from ._residuals import (
     control_faces_of,
     prior_faces,
 )
+from ._shifts import Border, Shifts, border_of
 from ._symmetry import Mirror, Symmetry, Ties, mirror_at, ties
 
 # Standard deviation of a step in control edges: what neither scan nor priors hold stays near where it is. A control
@@ -57,6 +58,7 @@ _PROBES = 16  # random vectors of a trace
 _MOST_RINGS = 3
 _TINY = np.finfo(float).tiny
 _BENDS = 1.0, 1e-5  # most and least bend asymmetry that is looked for, in control edges
+_FARTHEST = 1e3  # mm: standard deviation of a shift without a prior, so that a slice without weight has an equation
 
 
 class _Equations(NamedTuple):
@@ -71,10 +73,12 @@ class _Equations(NamedTuple):
     by_bend: Float[np.ndarray, "b d"]
     ties: Ties | None
     """Of the prior of symmetry, whose rows lie in no control face."""
+    border: Border | None
+    """Of the shifts, where slices may move."""
 
     @property
     def tied(self) -> sp.csc_array | None:
-        """Its matrix."""
+        """The matrix of the ties."""
         return None if self.ties is None else (self.ties.by.T @ self.ties.by).tocsc()
 
 
@@ -138,40 +142,51 @@ class Problem:
         self.annealed = False
         self.determined = 0.0
 
-    def step(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> Unknowns:
-        """The most probable offset from here, to first order. It also finds the next strength of the bend prior."""
-        found = self._equations(scheme, control, seen)
-        tied = found.tied
-        held = factorise(self._matrix(found.data + found.prior, self._hold, tied))
-        step = np.zeros(self.elements.n)
-        step[self.is_free] = -held.solve(found.gradient[self.is_free])
+    def step(
+        self, scheme: js.AbstractScheme, control: js.Control, seen: Look, shifts: Shifts | None = None
+    ) -> tuple[Unknowns, Shifts | None]:
+        """The most probable offset from here, to first order, and the shifts of slices together with it.
+
+        It also finds the next strength of the bend prior.
+        """
+        found = self._equations(scheme, control, seen, shifts)
+        held = factorise(self._whole(found, self._hold, 0.0 if shifts is None else np.repeat(shifts.hold, 2)))
+        n, step = int(self.is_free.sum()), np.zeros(self.elements.n)
+        of_shifts = np.zeros(0) if found.border is None else found.border.gradient
+        sides = np.zeros(held.shape[0])
+        sides[: n + len(of_shifts)] = np.append(found.gradient[self.is_free], of_shifts)
+        solution = -held.solve(sides)
+        step[self.is_free] = solution[:n]
         if found.ties is not None:
-            step = found.ties.with_plane(step, held.solve, self.is_free)
+            step = found.ties.with_plane(step, _first_part_of(held), self.is_free)
+        if shifts is not None:
+            within = solution[n : n + len(of_shifts)].reshape(-1, 2)
+            shifts = self._hold_what_shifts_back(shifts, within)
         # What is held says nothing of what the scan determines.
-        loose = (
-            factorise(self._matrix(found.data + found.prior, self.loose, tied))
-            if np.any(self._hold > self.loose)
-            else held
-        )
+        slack = shifts is None and not np.any(self._hold > self.loose)
+        loose = held if slack else factorise(self._whole(found, self.loose))
         self._hold_what_turns_back(step)
-        self._count_determined(found.data, loose)
+        self._count_determined(found, loose)
         if self._priors.bend is None:
             self._find_bend(found, step, loose)
         else:
             self._set_bend(self._precision * SOFTER)
-        return to_unknowns(jnp.asarray(step), self._zero)
+        return to_unknowns(jnp.asarray(step), self._zero), shifts
 
-    def precision_matrix(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> sp.csc_array:
-        """Of the free unknowns, about here: the inverse of their covariance."""
-        found = self._equations(scheme, control, seen)
-        return self._matrix(found.data + found.prior, self.loose, found.tied)
+    def precision_matrix(
+        self, scheme: js.AbstractScheme, control: js.Control, seen: Look, shifts: Shifts | None = None
+    ) -> sp.csc_array:
+        """Of the free unknowns about here, and after them of what `Border` adds: the inverse of their covariance."""
+        return self._whole(self._equations(scheme, control, seen, shifts), self.loose)
 
-    def _equations(self, scheme: js.AbstractScheme, control: js.Control, seen: Look) -> _Equations:
+    def _equations(
+        self, scheme: js.AbstractScheme, control: js.Control, seen: Look, shifts: Shifts | None
+    ) -> _Equations:
         start = self.start(scheme, control)
         if self._elements is None:
             self._elements = self._analyse(start)
         elements, found = self._elements, self._differentiate(start)
-        data, gradient = self._of_distances(found, seen)
+        data, gradient, border = self._of_distances(found, seen, shifts)
         rows, by_priors = jax.tree.map(lambda values: np.asarray(values, np.float64), (found.rows, found.by_rows))
         if not len(self._precision):
             # As smooth as the template, to begin with.
@@ -183,7 +198,11 @@ class Problem:
         tied = None if mirror is None else ties(mirror, control, self._zero)
         if tied is not None:
             gradient += tied.by.T @ tied.rows
-        return _Equations(data, prior, gradient, np.asarray(rows.bend), by_priors[: len(rows.bend)], tied)
+        if shifts is not None and border is not None:
+            of_prior = self._shift_precision * shifts.within.ravel()
+            across = sp.csr_array(border.across[self.is_free, :])
+            border = border._replace(across=across, gradient=border.gradient + of_prior)
+        return _Equations(data, prior, gradient, np.asarray(rows.bend), by_priors[: len(rows.bend)], tied, border)
 
     def mirror(self, control: js.Control) -> Mirror | None:
         """The prior of symmetry about here; None where there is none."""
@@ -254,17 +273,22 @@ class Problem:
             by,
             self._faces.bend,
             factorise(self._matrix(found.prior, self.loose, found.tied)).solve,
-            factor.solve,
+            _first_part_of(factor),  # what the scan says of the bends, not knowing how its slices are shifted
             self._around,
         )
         before = self._precision
         self._set_bend(next_one)
         self.annealed = bool(np.abs(np.log(self._precision / before)).mean() < _SETTLED)
 
-    def _count_determined(self, data: Float[np.ndarray, "_"], factor: SuperLU) -> None:
+    def _count_determined(self, found: _Equations, factor: SuperLU) -> None:
         """The trace of the scan's part of the posterior, by random vectors."""
-        probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(int(self.is_free.sum()), _PROBES))
-        of_data = self._matrix(data, np.zeros(len(self.is_free)))
+        probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(factor.shape[0], _PROBES))
+        of_data = self._matrix(found.data, np.zeros(len(self.is_free)))
+        of_data = (
+            of_data
+            if found.border is None
+            else found.border.around(of_data, 0.0, np.zeros((int(self.is_free.sum()), 3)), 0.0)
+        )
         self.determined = max(float(np.mean(np.sum(probes * factor.solve(of_data @ probes), axis=0))), 0.0)
 
     def _hold_what_turns_back(self, step: Float[np.ndarray, "n"]) -> None:
@@ -275,6 +299,12 @@ class Problem:
         factor[:n] = np.repeat(np.where(agree < 0, HOLD, LET_GO), width)
         self._hold = np.clip(self._hold * factor, self.loose, FASTEST * self.loose)
         self._last_step = step
+
+    def _hold_what_shifts_back(self, shifts: Shifts, step: Float[np.ndarray, "s 2"]) -> Shifts:
+        back = np.sum(step * shifts.step, axis=1) < 0
+        loosest = self._shift_precision
+        hold = np.clip(shifts.hold * np.where(back, HOLD, LET_GO), loosest, FASTEST * loosest)
+        return shifts._replace(within=shifts.within + step, step=step, hold=hold)
 
     def _set_bend(self, precision: Float[np.ndarray, "f"]) -> None:
         """The strength found; or the one that the priors ask for, or a stiffer one while it anneals."""
@@ -300,18 +330,27 @@ class Problem:
         elements, faces = self.elements, self._row_faces(start)
         return differentiate(self._zero, start, elements.seeds, elements.seeds_of, faces, self._patches.vertices)
 
-    def _of_distances(self, found: Derivatives, seen: Look) -> tuple[Float[np.ndarray, "_"], Float[np.ndarray, "n"]]:
-        """The scan's matrix, in the pattern of the elements, and its gradient."""
+    def _of_distances(
+        self, found: Derivatives, seen: Look, shifts: Shifts | None
+    ) -> tuple[Float[np.ndarray, "_"], Float[np.ndarray, "n"], Border | None]:
+        """The scan's matrix, in the pattern of the elements, its gradient, and what the shifts have to do with them."""
         elements, patches = self.elements, self._patches
         of_pairs = seen.pairs, self.distance_precisions(seen), np.asarray(seen.at.face)
-        if len(of_pairs[-1]) > patches.vertices.size:
-            return equations_of_many(elements, patches, found, *of_pairs)
-        data, gradient = np.zeros(elements.pattern.nnz), np.zeros(elements.n)
+        n_pairs = len(of_pairs[-1])
+        if shifts is None and n_pairs > patches.vertices.size:
+            return *equations_of_many(elements, patches, found, *of_pairs), None
+        data, gradient, border, first = np.zeros(elements.pattern.nnz), np.zeros(elements.n), None, 0
+        by_shifts = None if shifts is None else shifts.derivatives(seen.pairs.directions)
         for pairs, weights, at in padded(*of_pairs):
             distances, by, face = self._differentiate_distances(found, pairs, at)
             data += normal_matrix(elements, by, weights, face)
             gradient += times_transposed(elements, by, weights * distances, face)
-        return data, gradient
+            if by_shifts is not None:
+                points = np.minimum(np.arange(first, first + len(at)), n_pairs - 1)  # the rows of `padded`
+                this = border_of(jacobian(elements, by, face), sp.csr_array(by_shifts[points, :]), weights, distances)
+                border = this if border is None else border.plus(this)
+                first += len(at)
+        return data, gradient, border
 
     def _differentiate_distances(
         self, found: Derivatives, pairs: Pairs, at: Int[np.ndarray, "p"]
@@ -351,6 +390,25 @@ class Problem:
         self._elements = self._analyse(self.start(scheme, control))
         self._precision, self.determined, self.annealed, self._hold, self._last_step = memory
 
+    @property
+    def _shift_precision(self) -> float:
+        return min(float(self._priors.shift), _FARTHEST) ** -2
+
+    def _whole(
+        self, found: _Equations, hold: Float[np.ndarray, "n"], hold_shifts: float | Float[np.ndarray, "k"] = 0.0
+    ) -> sp.csc_array:
+        """Of scan and priors; where slices may move, bordered, see `Border`."""
+        matrix = self._matrix(found.data + found.prior, hold, found.tied)
+        if found.border is None:
+            return matrix
+        of_vertices, normals = np.zeros((len(hold), 3)), self._zero.normals
+        if self._zero.vertices is not None:
+            at = (3 if normals is None else 5) * np.arange(len(self._template))
+            for axis in range(3):
+                of_vertices[at + axis, axis] = hold[at + axis]
+        precision = self._shift_precision + hold_shifts
+        return found.border.around(matrix, precision, of_vertices[self.is_free], self._edge**-2)
+
     def _matrix(self, values: np.ndarray, diagonal: np.ndarray, tied: sp.csc_array | None = None) -> sp.csc_array:
         pattern = self.elements.pattern
         whole = sp.csc_array((values, pattern.indices, pattern.indptr), shape=pattern.shape)
@@ -365,6 +423,17 @@ class Problem:
 def factorise(matrix: sp.csc_array) -> SuperLU:
     # Symmetric and positive definite: no pivoting, and an ordering for symmetric patterns.
     return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+def _first_part_of(factor: SuperLU) -> Solve:
+    """Solves with the inverse's block of the first unknowns: the covariance of them alone."""
+
+    def solve(sides: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+        whole = np.zeros((factor.shape[0], sides.shape[1]))
+        whole[: len(sides)] = sides
+        return factor.solve(whole)[: len(sides)]
+
+    return solve
 
 
 def moved_to(template: AnyArray, vertices: AnyArray, xp: Any = np, *, scale: bool = True) -> AnyArray:

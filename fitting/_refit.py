@@ -29,6 +29,8 @@ class _Fixed(NamedTuple):
     start: Start
     pairs: Pairs
     zero: Unknowns
+    shifts: Float[Array, "p 3"] | None
+    """Of every point, in mm, where slices were free to move."""
     precisions: Float[Array, "p"]
     prior_precisions: Rows
     hold: Float[Array, "n"]
@@ -43,8 +45,8 @@ class Refit(eqx.Module):
 
     Get it from a fit: `refit = result.refit()`. Then `refit(points)` is a smooth function for `jax.grad`, `jax.jvp`,
     `jax.jit` and `jax.vmap`: the control that the fit would find from these points if every point kept its surface
-    point, its direction and its robust weight, and if the noise, the strength of the priors and the plane of symmetry
-    stayed what they were.
+    point, its direction and its robust weight, and if the noise, the strength of the priors, the plane of symmetry and
+    the shifts of slices stayed what they were.
 
     The derivative is that of the solution, not of the steps to it: of the volume of a fitted organ, say, by each of the
     scan points that it came from.
@@ -100,6 +102,7 @@ def _cost(
 ) -> Float[Array, ""]:
     vector = fixed.whitening @ z
     offset, start = to_unknowns(vector, fixed.zero), fixed.start
+    points = points if fixed.shifts is None else points + fixed.shifts
     rows = residuals(offset, start, fixed.pairs._replace(points=points))
     precisions = fixed.prior_precisions._replace(distance=fixed.precisions * weights)
     terms = [jnp.sum(precision * row**2) for precision, row in zip(precisions, rows, strict=True)]
@@ -123,7 +126,8 @@ def make_refit(posterior: Posterior) -> Refit:
             "Fit a coarser control mesh."
         )
     whitening = np.zeros((n, int(free.sum())))
-    whitening[free] = np.linalg.inv(np.linalg.cholesky(posterior.matrix.toarray())).T
+    conditional = posterior.matrix.toarray()[: posterior.n_free, : posterior.n_free]  # given the shifts
+    whitening[free] = np.linalg.inv(np.linalg.cholesky(conditional)).T
 
     def on_device(values: object) -> Array:
         return jnp.asarray(values, dtype)
@@ -134,6 +138,7 @@ def make_refit(posterior: Posterior) -> Refit:
             start=problem.start(posterior.scheme, posterior.control),
             pairs=posterior.seen.pairs,
             zero=no_offset(problem.free, posterior.scheme, posterior.control),
+            shifts=None if posterior.shifts is None else on_device(posterior.shifts.of_points()),
             precisions=on_device(problem.distance_precisions(posterior.seen)),
             prior_precisions=Rows(*map(on_device, problem.prior_precisions())),
             hold=on_device(problem.loose),

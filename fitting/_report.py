@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,6 +19,19 @@ class WorstPlace:
     position: list[float]
     distance: float
     n_points: int
+
+
+@dataclasses.dataclass(frozen=True)
+class SliceShift:
+    """How far a slice of the scan was shifted.
+
+    Attributes:
+        slice: its number, as `Scan.slices` has it.
+        shift: x, y, z in mm.
+    """
+
+    slice: int
+    shift: list[float]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +61,7 @@ class Report:
             below -0.2. None where the scheme does not look at normals.
         uncertainty_median, uncertainty_95: median and 95th percentile, over the covered area, of the surface's standard
             deviation; None where it was not asked for.
+        shifts: of the slices of the scan, which the distances have been measured after; empty where none was free.
         worst: up to five places where the scan lies farthest from the surface, one control edge apart.
     """
 
@@ -78,6 +93,7 @@ class Report:
     least_margin: float | None
     uncertainty_median: float | None
     uncertainty_95: float | None
+    shifts: list[SliceShift]
     worst: list[WorstPlace]
 
     def __str__(self) -> str:
@@ -120,6 +136,10 @@ class Report:
             rows.append(("tangent length h", ", ".join(f"{value:.4f}" for value in h)))
         if self.least_margin is not None:
             rows.append(("least margin of a normal", f"{self.least_margin:+.2f}"))
+        if self.shifts:
+            far = [math.hypot(*one.shift) for one in self.shifts]
+            root = math.sqrt(sum(length**2 for length in far) / len(far))
+            rows.append(("slices shifted", f"{len(far)}, by RMS {root:.2f} mm and {max(far):.2f} mm at most"))
         for i, place in enumerate(self.worst):
             at = ", ".join(f"{x:.1f}" for x in place.position)
             rows.append((f"worst place {i + 1}", f"{place.distance:+.3f} mm at ({at}), {place.n_points:,} points"))

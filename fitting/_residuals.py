@@ -48,6 +48,7 @@ class Priors(eqx.Module):
         symmetry: of the departure of a control vertex from the mirror image of its partner in mm, in each coordinate;
             of control normals, by as much as they move the surface. Default: left out. The mirror plane moves along
             with the mesh; `fit` finds the partners, or is given them (see `find_symmetry`).
+        shift: of how far breathing displaced a slice of the scan, in mm, along each of two axes of the slice's plane.
 
     Raises:
         ValueError: a standard deviation is not positive.
@@ -59,6 +60,7 @@ class Priors(eqx.Module):
     stretch: Float[Array, ""] = eqx.field(converter=_positive, default=0.2)
     h: Float[Array, ""] = eqx.field(converter=_positive, default=0.05)
     symmetry: Float[Array, ""] = eqx.field(converter=_positive, default=np.inf)
+    shift: Float[Array, ""] = eqx.field(converter=_positive, default=3.0)
 
 
 class Pairs(NamedTuple):

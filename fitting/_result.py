@@ -17,8 +17,9 @@ from ._posterior import Posterior, Uncertainty
 from ._problem import Problem
 from ._recipe import Recipe
 from ._refit import Refit, make_refit
-from ._report import Report, WorstPlace
+from ._report import Report, SliceShift, WorstPlace
 from ._scan import Scan
+from ._shifts import Shifts
 
 
 @final
@@ -41,6 +42,9 @@ class FitResult:
         result: `optimistix.RESULTS.successful`, or why the fit stopped without having converged.
         recipe: the settings that the fit was given, to fit the next scan in the same way.
         start: the control where the fit started, with the normals that it took.
+        shifts: how far each slice of the scan was shifted, in mm; no row where none was free to move.
+        slices: the number, in `Scan.slices`, of the slice of each row of `shifts`. Slices without a plane have no row.
+        points: the scan's points with these shifts put on: where the distances are measured from.
     """
 
     def __init__(
@@ -61,6 +65,7 @@ class FitResult:
         seen: Look,
         recipe: Recipe | None = None,
         start: js.Control | None = None,
+        shifts: Shifts | None = None,
     ):
         self.control = control
         self.scheme = scheme
@@ -75,18 +80,21 @@ class FitResult:
         self.result = result
         self.recipe = recipe
         self.start = start
-        self._problem, self._seen = problem, seen
+        self.shifts = np.zeros((0, 3)) if shifts is None else shifts.vectors
+        self.slices = np.zeros(0, int) if shifts is None else shifts.slices
+        self._problem, self._seen, self._shifts = problem, seen, shifts
 
     @functools.cached_property
     def posterior(self) -> Posterior:
         """The surfaces that scan and priors leave probable; made when it is first asked for."""
-        return Posterior(self._problem, self.scheme, self.control, self._seen)
+        return Posterior(self._problem, self.scheme, self.control, self._seen, self._shifts)
 
     def uncertainty(self) -> Uncertainty:
         """Standard deviations of the control vertices and of the surface's vertices, across the surface, in mm.
 
         They say how far the surface may be off the anatomy because of noise, holes and few points; not how far it is
-        where the control mesh is too coarse for it. Exact for up to 4,000 unknowns, else from random draws.
+        where the control mesh is too coarse for it. Shifts of slices count as unknown. Exact for up to 4,000 unknowns,
+        else from random draws.
         """
         return self._uncertainty
 
@@ -102,7 +110,10 @@ class FitResult:
         )
 
     def refit(self) -> Refit:
-        """The fitted control as a differentiable function of scan points and weights; see `Refit`."""
+        """The fitted control as a differentiable function of scan points and weights; see `Refit`.
+
+        Shifts of slices are held at what the fit found.
+        """
         return make_refit(self.posterior)
 
     def save(self, folder: str | os.PathLike[str]) -> None:
@@ -118,6 +129,10 @@ class FitResult:
         from ._saved import save  # which makes results itself
 
         save(folder, self)
+
+    @property
+    def points(self) -> Float[np.ndarray, "p 3"]:
+        return np.asarray(self._seen.pairs.points)
 
     @property
     def inliers(self) -> Bool[np.ndarray, "p"]:
@@ -159,11 +174,12 @@ class FitResult:
             rms_to_scan=float(np.sqrt(share @ away**2)) if known else None,
             percentile_95_to_scan=weighted_quantile(away, share, 0.95) if known else None,
             maximum_to_scan=float(away.max()) if known else None,
-            n_unknowns=int(self._problem.is_free.sum()),
+            n_unknowns=int(self._problem.is_free.sum()) + 2 * len(self.slices),
             determined=self._problem.determined,
             least_margin=float(js.admissible_margin(self.control_mesh).min()) if self.scheme.uses_normals else None,
             uncertainty_median=None if spread is None else weighted_quantile(spread, share, 0.5),
             uncertainty_95=None if spread is None else weighted_quantile(spread, share, 0.95),
+            shifts=[SliceShift(int(i), shift.tolist()) for i, shift in zip(self.slices, self.shifts, strict=True)],
             worst=[
                 WorstPlace(place.position.tolist(), place.distance, place.n_points)
                 for place in worst_places(self.surface, self._seen, self.distances, edge)

@@ -22,6 +22,7 @@ from ._recipe import Recipe
 from ._residuals import Anchors, Pairs
 from ._result import FitResult
 from ._scan import Scan
+from ._shifts import find_shifts
 from ._symmetry import symmetry_of
 
 _VERSION = 1
@@ -67,6 +68,8 @@ def save(folder: str | os.PathLike[str], result: FitResult) -> None:
         "robust_rms": result.robust_rms,
     }
     optional = {"h": result.scheme.h} | {f"scan_{name}": value for name, value in vars(scan).items()}
+    if result._shifts is not None:
+        optional |= {"slices": result.slices, "shifts": result.shifts}
     if found.anchors is not None:
         optional |= {f"anchor_{name}": value for name, value in found.anchors._asdict().items()}
     if found.symmetry is not None:
@@ -136,12 +139,20 @@ def _restored(arrays: dict[str, np.ndarray]) -> FitResult:
     if not ((face >= 0) & (face < surface.n_faces)).all():
         raise ValueError(f"'face' has rows of faces that there are not; the surface has {surface.n_faces}.")
 
-    scan = Scan(**{name: arrays.get(f"scan_{name}") for name in ("points", "normals", "weights", "deviations")})
+    of_scan = ("points", "normals", "weights", "deviations", "slices")
+    scan = Scan(**{name: arrays.get(f"scan_{name}") for name in of_scan})
+    shifts = None
+    if "shifts" in arrays:
+        shifts = find_shifts(scan)
+        if shifts is None or not np.array_equal(shifts.slices, arrays["slices"]):
+            raise ValueError("'slices' are not those of the scan that may move.")
+        shifts = shifts.at(arrays["shifts"])
+    points = scan.points if shifts is None else shifts.put_on(scan).points
     at = js.SurfacePoint(face, on_device("uv"))
     rms, robust_rms = arrays["rms"], arrays["robust_rms"]
     seen = Look(
         at=at,
-        pairs=Pairs(scan.points, *corner_weights(surface, at), on_device("directions")),
+        pairs=Pairs(points, *corner_weights(surface, at), on_device("directions")),
         distances=on_device("distances"),
         weights=on_device("weights"),
         precisions=on_device("precisions"),
@@ -178,4 +189,5 @@ def _restored(arrays: dict[str, np.ndarray]) -> FitResult:
         seen=seen,
         recipe=recipe,
         start=start,
+        shifts=shifts,
     )

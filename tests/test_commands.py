@@ -335,9 +335,9 @@ def test_rows_of_one_label_are_fitted_alone(files, capsys):
     points = problem().points + noise()
     rows = [f"{x},{y},{z},{'Left inside' if i % 2 else 'valve'}" for i, (x, y, z) in enumerate(points)]
     Path("heart.csv").write_text("\n".join(["x,y,z,contour", *rows]))
-    assert run(fit, "heart.csv", *GIVEN, "--label", "left", "--max-sweeps", 0, "-o", "out") == 1
+    assert run(fit, "heart.csv", *GIVEN, "--labels", "outside", "left", "--max-sweeps", 0, "-o", "out") == 1
     assert "scan     300 points, " in capsys.readouterr().out
-    assert run(fit, "heart.csv", *GIVEN, "--label", "right", "-o", "out") == 2
+    assert run(fit, "heart.csv", *GIVEN, "--labels", "right", "-o", "out") == 2
     assert "no row has a label that holds 'right'. It has: Left inside, valve." in capsys.readouterr().err
 
 

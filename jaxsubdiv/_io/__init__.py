@@ -6,7 +6,7 @@ the formats that need them, when they need them.
 
 import errno
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -151,6 +151,11 @@ def read_points(path: str | os.PathLike[str], *, scale: float | int = 1.0) -> Po
     normals = None if contents.normals is None else _numbers(path.name, "normals", contents.normals, (n, 3))
     weights = None if contents.weights is None else _numbers(path.name, "weights", contents.weights, (n,))
     return PointCloud(points * scale, normals, weights)
+
+
+def read_texts(path: Path, names: Sequence[str]) -> dict[str, list[str]]:
+    """Columns of text beside the points of `read_points`, row by row: those of the names that a table's header has."""
+    return _table.read_texts(path, names) if _FORMATS[path.suffix.lower()] is _TABLE else {}
 
 
 def write_mesh(

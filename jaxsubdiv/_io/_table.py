@@ -26,12 +26,8 @@ def read(path: Path) -> Contents:
     Commas, semicolons or white space part the columns. A header row names them in any order, and those of other names
     are left out. Without one there are 3 columns, or 6 with the normals. What follows a `#` is a comment.
     """
-    lines = enumerate(decode(path.read_bytes()).split("\n"), start=1)
-    rows = [(number, text) for number, line in lines if (text := line.partition("#")[0].strip())]
-    if not rows:
-        raise MeshError(f"{path.name}: it has no line of numbers.")
+    rows, delimiter = _rows(path)
     number, first = rows[0]
-    delimiter = ";" if ";" in first else "," if "," in first else None
     cells = _split(first, delimiter)
     if all(map(_is_number, cells)):
         if len(cells) not in (3, 6):
@@ -64,6 +60,27 @@ def read(path: Path) -> Contents:
 def _are_halves(table: Float[np.ndarray, "p 6"]) -> bool:
     """Whether rows of six whole numbers are three that were cut at their decimal commas: 1,25 read as 1 and 25."""
     return bool(np.median(np.linalg.norm(table[:, 3:6], axis=1)) > 2)  # of normals it is about 1
+
+
+def read_texts(path: Path, names: Sequence[str]) -> dict[str, list[str]]:
+    """Those of the named columns that the header row names, as text; the rows are those of `read`."""
+    rows, delimiter = _rows(path)
+    header = [cell.lower() for cell in _split(rows[0][1], delimiter)]
+    places = {name: header.index(name) for name in names if name in header}
+    if not places:
+        return {}
+    cells = [_split(text, delimiter) for _, text in rows[1:]]
+    return {name: [row[place] for row in cells] for name, place in places.items()}
+
+
+def _rows(path: Path) -> tuple[list[tuple[int, str]], str | None]:
+    """Lines that hold something, with their numbers, and what parts their columns."""
+    lines = enumerate(decode(path.read_bytes()).split("\n"), start=1)
+    rows = [(number, text) for number, line in lines if (text := line.partition("#")[0].strip())]
+    if not rows:
+        raise MeshError(f"{path.name}: it has no line of numbers.")
+    first = rows[0][1]
+    return rows, ";" if ";" in first else "," if "," in first else None
 
 
 def _check_names(path: Path, number: int, names: list[str]) -> None:

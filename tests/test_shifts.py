@@ -1,0 +1,242 @@
+"""Slices of a scan: read from files, shifted within their planes, and what the fit makes of it."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scans import N_POINTS, noise, problem
+
+import fitting
+import jaxsubdiv as js
+from fitting import Free, Priors, Scan, ScanError, read_scan
+from fitting._shifts import find_shifts
+
+N_SLICES = 10
+PLANTED = 2.0  # mm: standard deviation of the shifts along each axis
+
+
+@functools.cache
+def sliced() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points of the known surface in parallel slices, the slice of each, and a shift for each slice within it."""
+    p, rng = problem(), np.random.default_rng(4)
+    surface = js.refine(js.Interpolating(p.h), p.topology, p.truth)
+    points = np.asarray(js.sample(surface, 100_000, jax.random.key(1)).points)
+    heights = np.linspace(-13, 13, N_SLICES)
+    each = N_POINTS // N_SLICES
+    rows = [rng.choice(np.flatnonzero(np.abs(points[:, 2] - z) < 0.1), each, replace=False) for z in heights]
+    shifts = np.pad(rng.normal(scale=PLANTED, size=(N_SLICES, 2)), [(0, 0), (0, 1)])
+    return points[np.concatenate(rows)], np.repeat(3 * np.arange(N_SLICES), each), shifts - shifts.mean(axis=0)
+
+
+def displaced() -> Scan:
+    points, slices, shifts = sliced()
+    return Scan(points - shifts[slices // 3] + 0.3 * noise(), slices=slices)
+
+
+@functools.cache
+def shifted() -> fitting.FitResult:
+    return fit_slices()
+
+
+@functools.cache
+def unshifted() -> fitting.FitResult:
+    return fit_slices(free=Free(shifts=False))
+
+
+def fit_slices(scan: Scan | None = None, **options) -> fitting.FitResult:
+    p = problem()
+    return fitting.fit(js.Interpolating(), p.topology, p.start, scan or displaced(), throw=False, **options)
+
+
+def off_truth(result: fitting.FitResult) -> float:
+    p = problem()
+    surface = js.refine(js.Interpolating(p.h), p.topology, p.truth)
+    points = js.sample(surface, 2000, jax.random.key(5)).points
+    at = fitting.closest_points(result.surface, np.asarray(points))
+    return float(jnp.sqrt(jnp.mean((js.evaluate(result.surface, at).points - points) ** 2) * 3))
+
+
+def rms(rows: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.sum(rows**2, axis=1))))
+
+
+# Shifts
+
+
+def test_planted_shifts_are_found():
+    planted, result = sliced()[2], shifted()
+    np.testing.assert_array_equal(result.slices, 3 * np.arange(N_SLICES))
+    assert rms(planted) > 2.5 and rms(result.shifts - planted) < 0.3
+    np.testing.assert_allclose(result.shifts[:, 2], 0, atol=0.02)  # within the slices, which lie in z
+    # Nearly all that is left is a shift and a shear of the whole, which the slices alone cannot tell.
+    height = np.stack([np.ones(N_SLICES), np.arange(N_SLICES)], axis=1)
+    left = result.shifts - planted
+    assert rms(left - height @ np.linalg.lstsq(height, left, rcond=None)[0]) < 0.08
+
+
+def test_surface_is_nearer_the_truth_with_shifts_than_without():
+    assert off_truth(shifted()) < 0.2 < 1 < off_truth(unshifted())
+    assert shifted().rms[-1] < 0.12 < 0.5 < unshifted().rms[-1]
+    assert unshifted().shifts.shape == (0, 3) and unshifted().slices.shape == (0,)
+    assert shifted().report().converged
+
+
+def test_distances_are_those_of_the_shifted_points():
+    result, slices = shifted(), sliced()[1]
+    np.testing.assert_allclose(result.points - result.scan.points, result.shifts[slices // 3], atol=1e-12)
+    at = fitting.closest_points(result.surface, result.points)
+    away = np.linalg.norm(js.evaluate(result.surface, at).points - result.points, axis=1)
+    np.testing.assert_allclose(np.abs(result.distances), away, atol=1e-9)
+    np.testing.assert_array_equal(result.scan.points, displaced().points)
+
+
+def test_prior_holds_the_shifts():
+    tight, loose = (rms(fit_slices(priors=Priors(shift=sd)).shifts) for sd in (0.01, jnp.inf))
+    assert tight < 0.5 < 2.5 < rms(shifted().shifts) < 3.5
+    assert loose > 5  # nothing holds a shear of the whole
+
+
+def test_scan_without_slices_has_no_shifts():
+    p = problem()
+    result = fit_slices(Scan(p.points + noise()), max_sweeps=2)
+    assert result.shifts.shape == (0, 3) and not result.report().shifts
+    assert "slices" not in str(result.report())
+    np.testing.assert_array_equal(result.points, result.scan.points)
+
+
+def test_report_has_the_shifts():
+    report = shifted().report()
+    assert [one.slice for one in report.shifts] == shifted().slices.tolist()
+    np.testing.assert_allclose([one.shift for one in report.shifts], shifted().shifts)
+    lengths = np.linalg.norm(shifted().shifts, axis=1)
+    assert f"10, by RMS {rms(shifted().shifts):.2f} mm and {lengths.max():.2f} mm at most" in str(report)
+    assert report.n_unknowns == unshifted().report().n_unknowns + 2 * N_SLICES
+
+
+def test_uncertainty_knows_that_the_shifts_are_unknown():
+    """The surface's covariance is a block of the inverse of the whole: it is wider than if the shifts were known."""
+    posterior = shifted().posterior
+    whole, n = posterior.matrix.toarray(), posterior.n_free
+    free, known = np.linalg.inv(whole)[:n, :n], np.linalg.inv(whole[:n, :n])
+    assert np.linalg.eigvalsh(free - known).min() > -1e-9
+    # As a whole the surface is where the mean of the slices is, to PLANTED or so over their root.
+    axis = 5 * np.arange(12)
+    place = np.mean(free[np.ix_(axis, axis)]) ** 0.5
+    assert 0.7 < place / (3.0 / N_SLICES**0.5) < 1.1
+    assert np.mean(known[np.ix_(axis, axis)]) ** 0.5 < 0.2 * place
+    np.testing.assert_allclose(np.std(posterior.draws(2000)[axis].mean(axis=0)), place, rtol=0.1)
+
+
+def test_refit_holds_the_shifts():
+    result = shifted()
+    _, control = result.refit()(result.scan.points)
+    np.testing.assert_allclose(control.vertices, result.control.vertices, atol=0.15)  # as far as it was at rest
+    along = jnp.zeros_like(result.scan.points).at[:, 0].set(1.0)
+    _, moved = result.refit()(result.scan.points + along)
+    np.testing.assert_allclose(jnp.mean(moved.vertices - control.vertices, axis=0), (1, 0, 0), atol=0.1)
+
+
+def test_saved_fit_has_its_shifts(tmp_path):
+    result = shifted()
+    result.save(tmp_path)
+    again = fitting.load(tmp_path)
+    for name in ("shifts", "slices", "points", "distances"):
+        np.testing.assert_allclose(getattr(again, name), getattr(result, name), atol=1e-12, err_msg=name)
+    np.testing.assert_array_equal(again.scan.slices, result.scan.slices)
+    np.testing.assert_allclose(again.uncertainty().surface, result.uncertainty().surface, rtol=1e-9)
+    assert again.recipe.free.shifts and float(again.recipe.priors.shift) == 3.0
+    with np.load(tmp_path / "fit.npz") as file:
+        arrays = dict(file)
+    np.savez(tmp_path / "fit.npz", **(arrays | {"slices": np.arange(N_SLICES)}))
+    with pytest.raises(ValueError, match=r"fit\.npz: 'slices' are not those of the scan that may move"):
+        fitting.load(tmp_path)
+
+
+def test_cohort_leaves_slices_where_they_are_or_says_that_it_does_not_shift_them():
+    p = problem()
+    with pytest.raises(ScanError, match=r"scan 0: it has slices, which a cohort does not shift\. Give `free=Free"):
+        fitting.fit_cohort(js.Interpolating(), p.topology, p.start, [displaced()])
+
+
+# Slices
+
+
+def test_slices_that_are_short_of_points_or_straight_or_thick_stay():
+    rng = np.random.default_rng(0)
+    circle = np.stack([np.cos(np.arange(12)), np.sin(np.arange(12)), np.zeros(12)], axis=1)
+    parts = {7: circle, 2: circle[:9], 5: circle * (1, 0.05, 1), 9: rng.normal(size=(40, 3)), -1: circle[:, [2, 0, 1]]}
+    points = np.concatenate(list(parts.values()))
+    slices = np.repeat(list(parts), [len(rows) for rows in parts.values()])
+    found = find_shifts(Scan(points, slices=slices))
+    np.testing.assert_array_equal(found.slices, [-1, 7])
+    np.testing.assert_array_equal(found.of_point >= 0, np.isin(slices, [-1, 7]))
+    np.testing.assert_allclose(found.planes[0, :, 0], 0, atol=1e-12)
+    np.testing.assert_allclose(found.planes @ found.planes.swapaxes(1, 2), np.tile(np.eye(2), (2, 1, 1)), atol=1e-12)
+    ignored = np.where(slices == 7, 0.0, 1.0)
+    np.testing.assert_array_equal(find_shifts(Scan(points, weights=ignored, slices=slices)).slices, [-1])
+    assert find_shifts(Scan(points)) is None and find_shifts(Scan(points, slices=np.arange(len(points)))) is None
+
+
+def test_shifts_are_at_what_they_were_told():
+    found = find_shifts(displaced())
+    vectors = np.pad(np.random.default_rng(0).normal(size=(N_SLICES, 2)), [(0, 0), (0, 1)])
+    np.testing.assert_allclose(found.at(vectors).vectors, vectors, atol=0.01)
+    np.testing.assert_array_equal(found.vectors, 0)
+
+
+@pytest.mark.parametrize(
+    ("slices", "words"),
+    [
+        (np.arange(5), r"`slices` must have the shape \[8\]; got \[5\]"),
+        (np.full(8, 0.5), "`slices` must be whole numbers, one a point: number the slices"),
+        (np.full(8, np.nan), "`slices` must be whole numbers"),
+        (["base"] * 8, "`slices` must be whole numbers"),
+    ],
+)
+def test_slices_that_are_no_whole_numbers_or_too_few_are_refused(slices, words):
+    with pytest.raises(ScanError, match=words):
+        Scan(np.ones((8, 3)), slices=slices)
+
+
+# Files
+
+TABLE = """x,y,z,contour,slice,weight
+0,0,0,SAX_LV_ENDOCARDIAL,3,1
+1,0,0,SAX_LV_EPICARDIAL,3,0.5
+2,0,0,"LAX_LV_ENDOCARDIAL",1,0.25
+3,0,0,MITRAL_VALVE,1,1
+"""
+
+
+def test_tables_have_labels_slices_and_weights(tmp_path):
+    path = tmp_path / "heart.csv"
+    path.write_text(TABLE)
+    for labels, rows in (
+        ((), [0, 1, 2, 3]),
+        ("lv_endo", [0, 2]),
+        (["LV_ENDOCARDIAL"], [0, 2]),
+        (("LV_EPI", "valve"), [1, 3]),
+    ):
+        scan = read_scan(path, labels=labels)
+        np.testing.assert_array_equal(scan.points[:, 0], rows)
+        np.testing.assert_array_equal(scan.slices, np.array([3, 3, 1, 1])[rows])
+        np.testing.assert_array_equal(scan.weights, np.array([1, 0.5, 0.25, 1])[rows])
+    path.write_text(TABLE.replace(",slice", ",place").replace(",", ";"))
+    assert read_scan(path, labels="valve").slices is None and read_scan(path, labels="valve").n_points == 1
+    (tmp_path / "heart.txt").write_text("x y z slice\n1 2 3 -4\n")
+    assert read_scan(tmp_path / "heart.txt").slices.tolist() == [-4]
+
+
+def test_labels_and_slices_that_there_are_not_are_named(tmp_path):
+    path = tmp_path / "heart.csv"
+    path.write_text(TABLE)
+    with pytest.raises(ScanError, match=r"heart\.csv: no row has a label that holds 'RV' or 'AORTA'. It has: LAX_LV_E"):
+        read_scan(path, labels=["RV", "AORTA"])
+    path.write_text(TABLE.replace(",1,1", ",base,1"))
+    with pytest.raises(ScanError, match=r"heart\.csv: the column `slice` has 'base', which is no whole number"):
+        read_scan(path)
+    np.save(tmp_path / "a.npy", np.zeros((2, 3)))
+    with pytest.raises(ScanError, match=r"a\.npy: no row has a label that holds 'x'. It has: no column `label`"):
+        read_scan(tmp_path / "a.npy", labels="x")
