@@ -16,11 +16,11 @@ import time
 from collections.abc import Callable, Sequence
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from trimesh import Trimesh
@@ -87,6 +87,8 @@ class Problem(NamedTuple):
     """What a method is given: the scan, and a template of as many vertices as it asks for."""
 
     scan: Float[np.ndarray, "p 3"]
+    of_head: Bool[np.ndarray, "p"]
+    """Which points are no outliers: for the judge alone."""
     template: Callable[[int], Trimesh]
 
 
@@ -101,16 +103,27 @@ class Errors(NamedTuple):
     normals: float
 
 
+class Judgement(NamedTuple):
+    """Of a fit by its own numbers."""
+
+    f1: float
+    """Of the points that it takes for the head's."""
+    within: float
+    """Share of the surface where data, by area, that lies no farther from the truth than its `uncertainty()`."""
+
+
 def draw(truth: Trimesh, case: Case, seed: int) -> tuple[Problem, Float[np.ndarray, "3"]]:
     """The scan and template of a seed, and the centre of the hole. Cases of one seed share what they do not change."""
     hole_at, scan, start = np.random.default_rng(seed).spawn(3)
     centres = sample(truth, 1000, hole_at).points
     centre = centres[centres[:, 2] > truth.bounds[0, 2] + case.hole][0] if case.off_cap else centres[0]
     template = functools.cache(lambda n: make_template(truth, case, n, start.bit_generator.seed_seq))
-    return Problem(make_scan(truth, case, centre, scan), template), centre
+    return Problem(*make_scan(truth, case, centre, scan), template), centre
 
 
-def make_scan(truth: Trimesh, case: Case, centre: Float[np.ndarray, "3"], rng: np.random.Generator) -> np.ndarray:
+def make_scan(
+    truth: Trimesh, case: Case, centre: Float[np.ndarray, "3"], rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "p 3"], Bool[np.ndarray, "p"]]:
     """Points uniform by area with isotropic noise, among them outliers uniform in a box; none inside the hole."""
     n_outliers = round(case.outliers * case.points)
     points = sample(truth, case.points - n_outliers, rng).points
@@ -118,7 +131,9 @@ def make_scan(truth: Trimesh, case: Case, centre: Float[np.ndarray, "3"], rng: n
     low, high = truth.bounds
     outliers = (low + high) / 2 + BOX * (high - low) * rng.uniform(-0.5, 0.5, (n_outliers, 3))
     scan = np.concatenate([points, outliers])
-    return rng.permutation(scan[np.linalg.norm(scan - centre, axis=1) > case.hole])
+    there = np.flatnonzero(np.linalg.norm(scan - centre, axis=1) > case.hole)
+    order = there[rng.permutation(len(there))]
+    return scan[order], order < len(points)
 
 
 def make_template(truth: Trimesh, case: Case, n_vertices: int, seed: np.random.SeedSequence) -> Trimesh:
@@ -180,6 +195,18 @@ def measure(
     return Errors(*map(float, (*distances, distance.max(), angle.mean())))
 
 
+def judge(
+    result: fitting.FitResult, problem: Problem, truth: Trimesh, centre: Float[np.ndarray, "3"], radius: float
+) -> Judgement:
+    kept, right = result.inliers, problem.of_head
+    f1 = 2 * np.sum(kept & right) / (np.sum(kept) + np.sum(right))
+    vertices = np.asarray(result.surface.vertices, np.float64)
+    on, areas = nearest(truth, vertices).points, fitting._coverage.vertex_areas(result.surface)
+    known = areas * (np.linalg.norm(on - centre, axis=1) >= radius)
+    within = np.linalg.norm(on - vertices, axis=1) <= result.uncertainty().surface
+    return Judgement(float(f1), float(np.sum(known * within) / np.sum(known)))
+
+
 def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
@@ -203,30 +230,30 @@ def nearest(mesh: Trimesh, points: Float[np.ndarray, "p 3"]) -> Samples:
     return Samples(on, trimesh.unitize(np.sum(mesh.vertex_normals[mesh.faces[face]] * weights[:, :, None], axis=1)))
 
 
-def jaxsubdiv(problem: Problem, scheme: js.AbstractScheme) -> Trimesh:
+def jaxsubdiv(problem: Problem, scheme: js.AbstractScheme) -> fitting.FitResult:
     template = problem.template(TEMPLATE_VERTICES)
     mesh = js.ControlMesh(template.vertices, template.faces, template.vertex_normals)
-    return surface_of(fitting.fit_scan(fitting.Scan(problem.scan), mesh, scheme=scheme, levels=2, throw=False))
+    return fitting.fit_scan(fitting.Scan(problem.scan), mesh, scheme=scheme, levels=2, throw=False).result
 
 
-def jaxsubdiv_alone(problem: Problem) -> Trimesh:
+def jaxsubdiv_alone(problem: Problem) -> fitting.FitResult:
     """Without a template, at as many faces."""
     faces = 2 * TEMPLATE_VERTICES - 4
-    return surface_of(fitting.fit_scan(fitting.Scan(problem.scan), faces=faces, closed=True, levels=2, throw=False))
+    return fitting.fit_scan(fitting.Scan(problem.scan), faces=faces, closed=True, levels=2, throw=False).result
 
 
-def jaxsubdiv_split(problem: Problem) -> Trimesh:
+def jaxsubdiv_split(problem: Problem) -> fitting.FitResult:
     """The template split once: four times the control vertices."""
     template = problem.template(TEMPLATE_VERTICES)
     mesh = js.ControlMesh(template.vertices, template.faces, template.vertex_normals)
     found = fitting.fit_scan(
         fitting.Scan(problem.scan), mesh, levels=2, tolerance_mm=0.01, most_faces=6000, throw=False
     )
-    return surface_of(found)
+    return found.result
 
 
-def surface_of(found: fitting.ScanFit) -> Trimesh:
-    surface = found.result.surface
+def surface_of(result: fitting.FitResult) -> Trimesh:
+    surface = result.surface
     return Trimesh(np.asarray(surface.vertices, np.float64), np.asarray(surface.triangles()), process=False)
 
 
@@ -278,7 +305,7 @@ def align(mesh: Trimesh, scan: Float[np.ndarray, "p 3"]) -> Trimesh:
     return Trimesh(moved.vertices, mesh.faces, vertex_normals=moved.normals, process=False)
 
 
-METHODS: dict[str, Callable[[Problem], Trimesh]] = {
+METHODS: dict[str, Callable[[Problem], Trimesh | fitting.FitResult]] = {
     "jaxsubdiv": lambda problem: jaxsubdiv(problem, js.Interpolating()),
     "jaxsubdiv-no-template": jaxsubdiv_alone,
     "jaxsubdiv-split": jaxsubdiv_split,
@@ -298,8 +325,11 @@ def run(truth: Trimesh, cases: Sequence[str], methods: Sequence[str], seeds: Seq
             for seed, (problem, centre) in problems.items():
                 row = {"case": name, "method": method, "seed": seed}
                 try:
-                    fitted, row["cpu_s"], row["wall_s"] = timed(METHODS[method], problem)
-                    errors = measure(fitted, truth, centre, CASES[name].hole, np.random.default_rng(seed))
+                    found, row["cpu_s"], row["wall_s"] = timed(METHODS[method], problem)
+                    if isinstance(found, fitting.FitResult):
+                        row |= judge(found, problem, truth, centre, CASES[name].hole)._asdict()
+                        found = surface_of(found)
+                    errors = measure(found, truth, centre, CASES[name].hole, np.random.default_rng(seed))
                     rows.append(row | errors._asdict())
                 except Exception as error:  # a method that fails or is missing must not take the others' numbers along
                     rows.append(row | {"error": f"{type(error).__name__}: {error}"})
@@ -307,7 +337,7 @@ def run(truth: Trimesh, cases: Sequence[str], methods: Sequence[str], seeds: Seq
     return rows
 
 
-def timed(method: Callable[[Problem], Trimesh], problem: Problem) -> tuple[Trimesh, float, float]:
+def timed(method: Callable[[Problem], Any], problem: Problem) -> tuple[Any, float, float]:
     """What a method finds, its CPU and its wall seconds, compilation included; templates are made beforehand."""
     for n_vertices in (TEMPLATE_VERTICES, NRICP_VERTICES):
         problem.template(n_vertices)
@@ -316,15 +346,27 @@ def timed(method: Callable[[Problem], Trimesh], problem: Problem) -> tuple[Trime
     return fitted, time.process_time() - cpu, time.perf_counter() - wall
 
 
-HEADINGS = ("total", "where data", "in the hole", "p95", "Hausdorff", "normals, deg", "CPU s", "wall s")
+HEADINGS = (
+    "total",
+    "where data",
+    "in the hole",
+    "p95",
+    "Hausdorff",
+    "normals, deg",
+    "F1",
+    "within 1 sd",
+    "CPU s",
+    "wall s",
+)
+COLUMNS = (*Errors._fields, *Judgement._fields, "cpu_s", "wall_s")
 
 
 def table(rows: list[dict]) -> str:
     """Markdown: means over the seeds; below, what there are no numbers for."""
-    lines = ["| case | method | seeds | " + " | ".join(HEADINGS) + " |", "|---|---|" + "--:|" * 9]
+    lines = ["| case | method | seeds | " + " | ".join(HEADINGS) + " |", "|---|---|" + "--:|" * 11]
     for case, method in dict.fromkeys((row["case"], row["method"]) for row in rows if "error" not in row):
         of = [row for row in rows if (row["case"], row["method"]) == (case, method) and "error" not in row]
-        means = (f"{np.mean([row[key] for row in of]):.3g}" for key in (*Errors._fields, "cpu_s", "wall_s"))
+        means = (f"{np.mean([row[key] for row in of]):.3g}" if key in of[0] else "" for key in COLUMNS)
         lines.append(f"| {case} | {method} | {len(of)} | " + " | ".join(means) + " |")
     without = dict.fromkeys(f"{row['method']}: {row['error']}" for row in rows if "error" in row)
     return "\n".join([*lines, *(f"\nSkipped, {why}" for why in without)])
