@@ -259,3 +259,9 @@ def test_labels_and_slices_that_there_are_not_are_named(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros((2, 3)))
     with pytest.raises(ScanError, match=r"a\.npy: no row has a label that holds 'x'. It has: no column `label`"):
         read_scan(tmp_path / "a.npy", labels="x")
+
+
+def test_contours_of_a_heart(shared_data):
+    scan = read_scan(shared_data / "heart_guidepoints_a.csv", labels="LV_ENDOCARDIAL")
+    assert scan.n_points == 5200 and scan.weights.shape == (5200,)
+    np.testing.assert_array_equal(find_shifts(scan).slices, np.arange(1, 21))
