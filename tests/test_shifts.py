@@ -154,10 +154,29 @@ def test_saved_fit_has_its_shifts(tmp_path):
         fitting.load(tmp_path)
 
 
+@pytest.mark.parametrize("sweeps", [1, 3])
+def test_fit_that_was_stopped_goes_on_with_its_shifts(tmp_path, sweeps):
+    def stop(sweep):
+        if sweep.number > sweeps:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        fit_slices(checkpoint=tmp_path, on_sweep=stop)
+    numbers = []
+    again = fit_slices(checkpoint=tmp_path, on_sweep=lambda sweep: numbers.append(sweep.number))
+    assert numbers == list(range(sweeps + 1, len(shifted().rms)))
+    np.testing.assert_array_equal(again.shifts, shifted().shifts)
+    np.testing.assert_array_equal(again.control.vertices, shifted().control.vertices)
+
+
 def test_cohort_leaves_slices_where_they_are_or_says_that_it_does_not_shift_them():
     p = problem()
     with pytest.raises(ScanError, match=r"scan 0: it has slices, which a cohort does not shift\. Give `free=Free"):
         fitting.fit_cohort(js.Interpolating(), p.topology, p.start, [displaced()])
+    options = {"free": Free(shifts=False), "priors": Priors(bend=0.5), "max_sweeps": 1}
+    with pytest.warns(UserWarning, match="did not converge"):
+        cohort = fitting.fit_cohort(js.Interpolating(), p.topology, p.start, [displaced()], **options)
+    assert cohort.result(0).slices.shape == (0,)
 
 
 # Slices
@@ -240,3 +259,9 @@ def test_labels_and_slices_that_there_are_not_are_named(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros((2, 3)))
     with pytest.raises(ScanError, match=r"a\.npy: no row has a label that holds 'x'. It has: no column `label`"):
         read_scan(tmp_path / "a.npy", labels="x")
+
+
+def test_contours_of_a_heart(shared_data):
+    scan = read_scan(shared_data / "heart_guidepoints_a.csv", labels="LV_ENDOCARDIAL")
+    assert scan.n_points == 5200 and scan.weights.shape == (5200,)
+    np.testing.assert_array_equal(find_shifts(scan).slices, np.arange(1, 21))
