@@ -132,6 +132,7 @@ class FitResult:
 
     @property
     def points(self) -> Float[np.ndarray, "p 3"]:
+        """The scan's points, moved by the shifts of their slices, in mm."""
         return np.asarray(self._seen.pairs.points)
 
     @property

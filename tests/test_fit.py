@@ -349,7 +349,8 @@ def broken_from(sweep: int, monkeypatch: pytest.MonkeyPatch, value: float) -> No
         step = sound(self, *start)
         if len(calls) < sweep:
             return step
-        return dataclasses.replace(step, vertices=step.vertices.at[3, 1].set(value))
+        offset, shifts = step
+        return dataclasses.replace(offset, vertices=offset.vertices.at[3, 1].set(value)), shifts
 
     monkeypatch.setattr(_fit.Problem, "step", broken)
 

@@ -384,6 +384,7 @@ def test_page_of_a_large_surface_stays_under_three_megabytes(tmp_path, monkeypat
     result.surface = js.refine(js.Interpolating(), topology, p.start)
     points = np.tile(np.asarray(result.scan.points), (50, 1))
     result.scan, result.distances = fitting.Scan(points), np.tile(result.distances, 50)
+    monkeypatch.setattr(fitting.FitResult, "points", points)
     monkeypatch.setattr("fitting._page.distances_to_scan", lambda surface, *_: np.full(len(surface.vertices), np.nan))
     write_page(tmp_path / "fit.html", result, uncertainty=False)
     assert len(result.surface.vertices) > 10_000 and (tmp_path / "fit.html").stat().st_size < 3_000_000
