@@ -28,14 +28,14 @@ from trimesh import Trimesh
 import fitting
 import jaxsubdiv as js
 
-HEAD = "head_colin27.ply"
+HEAD, CORTEX = "head_colin27.ply", "cortex_left_colin27.surf.gii"
+# Remeshing its folds leaves no manifold: its template is a control mesh of 498 vertices, split once.
+CORTEX_MESH, CORTEX_VERTICES = "control/cortex_tri.obj", 1986
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 SAMPLES = 100_000  # on each of the two surfaces
 BOX = 1.2  # outliers fill the bounding box of the head, this much larger
-TEMPLATE_VERTICES = 650
 NRICP_VERTICES = 2600  # registration moves vertices only: it needs more of them
-SMOOTHING = 100  # iterations of Taubin on the dense head: takes away what a template of another person would not have
 # Of a warp of 6 mm rms, waves this long leave about 2.4 mm rms after a similarity alignment, as two people differ.
 WARP_LENGTH = 145.0
 WAVES = 64
@@ -45,11 +45,14 @@ VERSIONS = ("jaxsubdiv", "jax", "optimistix", "trimesh", "open3d", "pymeshlab", 
 class Case(NamedTuple):
     """What is drawn for every seed."""
 
+    truth: str = HEAD
+    vertices: int = 650  # of the template
     points: int = 20_000  # before the hole is cut
     sigma: float = 0.5
     outliers: float = 0.05  # share of the points
     hole: float = 40.0  # radius of the ball without points
     off_cap: bool = False  # keeps the ball away from the flat cap that closes the head, 21 % of its area
+    smoothing: int = 100  # iterations of Taubin: takes away what a template of another person would not have
     warp: float = 6.0  # of the template, rms
     rotation: float = 8.0  # degrees
     scale: float = 0.95
@@ -73,6 +76,7 @@ CASES = {
     "scale-0.8": Case(scale=0.8),
     "scale-1.2": Case(scale=1.2),
     "bad-start": Case(warp=12.0, rotation=30.0, scale=0.8),
+    "cortex": Case(CORTEX, vertices=CORTEX_VERTICES, points=40_000, sigma=0.25, hole=20.0, smoothing=0, warp=2.0),
 }
 
 
@@ -90,6 +94,8 @@ class Problem(NamedTuple):
     of_head: Bool[np.ndarray, "p"]
     """Which points are no outliers: for the judge alone."""
     template: Callable[[int], Trimesh]
+    n_vertices: int
+    """That the case has in mind for it."""
 
 
 class Errors(NamedTuple):
@@ -110,6 +116,8 @@ class Judgement(NamedTuple):
     """Of the points that it takes for the head's."""
     within: float
     """Share of the surface where data, by area, that lies no farther from the truth than its `uncertainty()`."""
+    crossing: float
+    """Triangles of the surface that cross others."""
 
 
 def draw(truth: Trimesh, case: Case, seed: int) -> tuple[Problem, Float[np.ndarray, "3"]]:
@@ -118,7 +126,7 @@ def draw(truth: Trimesh, case: Case, seed: int) -> tuple[Problem, Float[np.ndarr
     centres = sample(truth, 1000, hole_at).points
     centre = centres[centres[:, 2] > truth.bounds[0, 2] + case.hole][0] if case.off_cap else centres[0]
     template = functools.cache(lambda n: make_template(truth, case, n, start.bit_generator.seed_seq))
-    return Problem(*make_scan(truth, case, centre, scan), template), centre
+    return Problem(*make_scan(truth, case, centre, scan), template, case.vertices), centre
 
 
 def make_scan(
@@ -139,14 +147,22 @@ def make_scan(
 def make_template(truth: Trimesh, case: Case, n_vertices: int, seed: np.random.SeedSequence) -> Trimesh:
     """The smoothed head, warped, rotated, scaled, shifted, then remeshed; vertex normals from the dense mesh."""
     rng = np.random.default_rng(seed)
-    dense = truth.copy()
-    trimesh.smoothing.filter_taubin(dense, iterations=SMOOTHING)
+    is_cortex = case.truth == CORTEX
+    dense = split_once(DATA / CORTEX_MESH) if is_cortex else truth.copy()
+    trimesh.smoothing.filter_taubin(dense, iterations=case.smoothing)
     x = dense.vertices - dense.centroid
     warp = smooth_field(x, rng)
     x = x + case.warp * warp / np.sqrt(np.mean(np.sum(warp**2, axis=1)))
     axis, shift = trimesh.unitize(rng.normal(size=(2, 3)))
     x = case.scale * Rotation.from_rotvec(case.rotation * axis, degrees=True).apply(x) + case.shift * shift
-    return remesh(Trimesh(x + dense.centroid, dense.faces, process=False), n_vertices)
+    moved = Trimesh(x + dense.centroid, dense.faces, process=False)
+    return moved if is_cortex else remesh(moved, n_vertices)
+
+
+def split_once(path: Path) -> Trimesh:
+    mesh, scheme = js.read_mesh(path), js.ModifiedButterfly()
+    surface = js.refine(scheme, js.build_topology(mesh, scheme, 1), mesh.control())
+    return Trimesh(np.asarray(surface.vertices, np.float64), np.asarray(surface.faces[3]), process=False)
 
 
 def smooth_field(x: Float[np.ndarray, "v 3"], rng: np.random.Generator) -> Float[np.ndarray, "v 3"]:
@@ -204,7 +220,16 @@ def judge(
     on, areas = nearest(truth, vertices).points, fitting._coverage.vertex_areas(result.surface)
     known = areas * (np.linalg.norm(on - centre, axis=1) >= radius)
     within = np.linalg.norm(on - vertices, axis=1) <= result.uncertainty().surface
-    return Judgement(float(f1), float(np.sum(known * within) / np.sum(known)))
+    return Judgement(float(f1), float(np.sum(known * within) / np.sum(known)), crossing_faces(surface_of(result)))
+
+
+def crossing_faces(surface: Trimesh) -> float:
+    import pymeshlab
+
+    meshes = pymeshlab.MeshSet(verbose=False)
+    meshes.add_mesh(pymeshlab.Mesh(surface.vertices, surface.faces))
+    meshes.compute_selection_by_self_intersections_per_face()
+    return float(meshes.current_mesh().selected_face_number())
 
 
 def rms(values: np.ndarray) -> float:
@@ -231,20 +256,20 @@ def nearest(mesh: Trimesh, points: Float[np.ndarray, "p 3"]) -> Samples:
 
 
 def jaxsubdiv(problem: Problem, scheme: js.AbstractScheme) -> fitting.FitResult:
-    template = problem.template(TEMPLATE_VERTICES)
+    template = problem.template(problem.n_vertices)
     mesh = js.ControlMesh(template.vertices, template.faces, template.vertex_normals)
     return fitting.fit_scan(fitting.Scan(problem.scan), mesh, scheme=scheme, levels=2, throw=False).result
 
 
 def jaxsubdiv_alone(problem: Problem) -> fitting.FitResult:
     """Without a template, at as many faces."""
-    faces = 2 * TEMPLATE_VERTICES - 4
+    faces = 2 * problem.n_vertices - 4
     return fitting.fit_scan(fitting.Scan(problem.scan), faces=faces, closed=True, levels=2, throw=False).result
 
 
 def jaxsubdiv_split(problem: Problem) -> fitting.FitResult:
     """The template split once: four times the control vertices."""
-    template = problem.template(TEMPLATE_VERTICES)
+    template = problem.template(problem.n_vertices)
     mesh = js.ControlMesh(template.vertices, template.faces, template.vertex_normals)
     found = fitting.fit_scan(
         fitting.Scan(problem.scan), mesh, levels=2, tolerance_mm=0.01, most_faces=6000, throw=False
@@ -316,10 +341,17 @@ METHODS: dict[str, Callable[[Problem], Trimesh | fitting.FitResult]] = {
 }
 
 
-def run(truth: Trimesh, cases: Sequence[str], methods: Sequence[str], seeds: Sequence[int]) -> list[dict]:
+@functools.cache
+def true_surface(path: Path) -> Trimesh:
+    mesh = js.read_mesh(path)
+    return Trimesh(mesh.vertices, mesh.faces[3], vertex_normals=mesh.normals, process=False)
+
+
+def run(data: Path, cases: Sequence[str], methods: Sequence[str], seeds: Sequence[int]) -> list[dict]:
     """A row a case, method and seed, told as it comes. One without numbers says why under `error`."""
     rows = []
     for name in cases:
+        truth = true_surface(data / CASES[name].truth)
         problems = {seed: draw(truth, CASES[name], seed) for seed in seeds}
         for method in methods:
             for seed, (problem, centre) in problems.items():
@@ -339,7 +371,7 @@ def run(truth: Trimesh, cases: Sequence[str], methods: Sequence[str], seeds: Seq
 
 def timed(method: Callable[[Problem], Any], problem: Problem) -> tuple[Any, float, float]:
     """What a method finds, its CPU and its wall seconds, compilation included; templates are made beforehand."""
-    for n_vertices in (TEMPLATE_VERTICES, NRICP_VERTICES):
+    for n_vertices in (problem.n_vertices, NRICP_VERTICES):
         problem.template(n_vertices)
     wall, cpu = time.perf_counter(), time.process_time()
     fitted = method(problem)
@@ -363,7 +395,7 @@ COLUMNS = (*Errors._fields, *Judgement._fields, "cpu_s", "wall_s")
 
 def table(rows: list[dict]) -> str:
     """Markdown: means over the seeds; below, what there are no numbers for."""
-    lines = ["| case | method | seeds | " + " | ".join(HEADINGS) + " |", "|---|---|" + "--:|" * 11]
+    lines = ["| case | method | seeds | " + " | ".join(HEADINGS) + " |", "|---|---|" + "--:|" * 12]
     for case, method in dict.fromkeys((row["case"], row["method"]) for row in rows if "error" not in row):
         of = [row for row in rows if (row["case"], row["method"]) == (case, method) and "error" not in row]
         means = (f"{np.mean([row[key] for row in of]):.3g}" if key in of[0] else "" for key in COLUMNS)
@@ -374,7 +406,7 @@ def table(rows: list[dict]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--data", type=Path, default=DATA, help=f"folder that holds {HEAD} (default: {DATA})")
+    parser.add_argument("--data", type=Path, default=DATA, help=f"folder of the true surfaces (default: {DATA})")
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), metavar="CASE", help=", ".join(CASES))
     parser.add_argument(
         "--methods", nargs="+", choices=METHODS, default=list(METHODS), metavar="METHOD", help=", ".join(METHODS)
@@ -382,11 +414,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", nargs="+", type=int, default=range(5), metavar="SEED", help="default: 0 1 2 3 4")
     parser.add_argument("--output", type=Path, default=Path("fit_protocol.json"), help="default: %(default)s")
     options = parser.parse_args(arguments)
-    if not (options.data / HEAD).is_file():
-        print(f"error: {options.data / HEAD} is not there. The head is not shipped: name its folder with --data.")
+    missing = {CASES[case].truth for case in options.cases if not (options.data / CASES[case].truth).is_file()}
+    if missing:
+        words = " and ".join(sorted(missing))
+        print(f"error: {options.data} has no {words}. They are not shipped: name their folder with --data.")
         return 2
-    truth = trimesh.load_mesh(options.data / HEAD, process=False)
-    rows = run(truth, options.cases, options.methods, options.seeds)
+    rows = run(options.data, options.cases, options.methods, options.seeds)
     versions = {found.name: found.version for found in distributions() if found.name in VERSIONS}
     options.output.write_text(json.dumps({"versions": versions, "rows": rows}, indent=2) + "\n", encoding="utf-8")
     print(table(rows))
