@@ -387,6 +387,7 @@ HEADINGS = (
     "normals, deg",
     "F1",
     "within 1 sd",
+    "crossing",
     "CPU s",
     "wall s",
 )
