@@ -2,7 +2,7 @@
 
     pip install -e '.[bench]' && python tests/bench/fit_real.py --pictures real
 
-Prints a Markdown table, lengths in mm. Every case has a process of its own and is fitted twice: the first time compiles.
+Prints a Markdown table, lengths in mm. Every case has a process of its own and is fitted twice: at first it compiles.
 With --pictures each leaves a picture and its fit (`fitting.load`) in that folder, and montage.png shows some of them.
 
 Two of the scans ship with the package. The others are taken from ../shared/data beside the repository, or from --data;
@@ -167,7 +167,9 @@ def draw_montage(names: Sequence[str], pictures: Path) -> None:
         above.set_title(f"{name}\n{result.scan.n_points:,} points, {len(result.control.vertices):,} vertices", size=10)
         values = surface_distances(result)
         limit = float(np.percentile(np.abs(result.distances), 95))
-        colours = js.draw_surface(below, result.surface, view=view, values=values, limits=(-limit, limit), cmap="RdBu_r")
+        colours = js.draw_surface(
+            below, result.surface, view=view, values=values, limits=(-limit, limit), cmap="RdBu_r"
+        )
         bar = figure.colorbar(colours, ax=below, orientation="horizontal", shrink=0.7, aspect=30, pad=0.02)
         bar.set_label(f"mm; RMS {result.rms[-1]:.2f} mm", size=9)
     figure.savefig(pictures / "montage.png")
