@@ -29,7 +29,7 @@ from ._residuals import Anchors, Priors
 from ._result import FitResult
 from ._robust import AbstractLoss, geman_mcclure
 from ._scan import Scan, ScanError
-from ._shifts import find_shifts
+from ._shifts import find_shifts, find_strokes
 from ._symmetry import Symmetry, find_symmetry, symmetry_of
 
 # A start that is off by more than this part of the control mesh's size is not roughly aligned.
@@ -136,9 +136,13 @@ def fit(
 
     def seen_from(surface: js.RefinedSurface, here: Scan, floor: float) -> Look:
         held = None if curve is None else held_vertices(curve, surface, edge)
-        return look(surface, here, open_vertices, around, edge, loss, floor, held)
+        seen = look(surface, here, open_vertices, around, edge, loss, floor, held)
+        if strokes is None:
+            return seen
+        alike = strokes.points_a_measurement(np.asarray(seen.distances), np.asarray(seen.weights))
+        return seen._replace(precisions=seen.precisions / alike)
 
-    here, around = scan.without_slices(), surroundings(scan)
+    here, around, strokes = scan.without_slices(), surroundings(scan), find_strokes(scan)
     seen = seen_from(surface, here, LEAST_NOISE * edge)
     widest = float(seen.scale)  # a robust scale of the start's own error: outliers must not widen it
     _warn_if_far(float(np.median(np.abs(seen.distances))), control)

@@ -55,7 +55,8 @@ class Surroundings(NamedTuple):
     scattered: Bool[Array | np.ndarray, "p"]
     """Whether it and the points near it lie in space, on no surface: it has no say."""
     trusted: Bool[Array | np.ndarray, "p"]
-    """Whether what it has in common with its neighbours counts: in a scan of few scattered points, where crowded."""
+    """Whether what it has in common with its neighbours counts: in a scan of few scattered points, where crowded; not
+    in slices, which may be displaced as a whole."""
     neighbours: Int[Array | np.ndarray, "p k"]
     """Rows of the nearest points, without itself."""
 
@@ -72,7 +73,8 @@ def surroundings(scan: Scan) -> Surroundings:
         scattered[counted] = scattered_points(points, crowded[counted])
         if len(counted) > 1:
             neighbours[counted] = counted[rows[:, 1 : _NEIGHBOURS + 1]]
-    return Surroundings(crowded, scattered, crowded & (crowded.sum() > _CLEAN * len(counted)), neighbours)
+    clean = scan.slices is None and crowded.sum() > _CLEAN * len(counted)
+    return Surroundings(crowded, scattered, crowded & clean, neighbours)
 
 
 def look(

@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float, Int
+from scipy.spatial import KDTree
 
+from ._correspondence import nearest_rows
 from ._scan import Scan
 
 _FEWEST = 10  # points of a slice that may move
@@ -97,6 +99,43 @@ def _plane(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 3"] | None:
         return None
     _, (length, width, thickness), axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
     return axes[:2] if width > _STRAIGHT * length and thickness < _THICK * width else None
+
+
+class Strokes(NamedTuple):
+    """The contours of a scan in slices, which a person drew with a few strokes: neighbours share their errors."""
+
+    nearest: Int[np.ndarray, "p"]
+    """The row of the nearest point of the same slice."""
+    most: float
+    """Points of a contour in a row, as many as make up the distance between slices."""
+
+    def points_a_measurement(self, distances: Float[np.ndarray, "p"], weights: Float[np.ndarray, "p"]) -> float:
+        """How many points of a contour tell as much as one measurement; 1 where their distances are independent.
+
+        With the correlation r of the distances of neighbours, (1 + r) / (1 - r) points count as one: so it is with the
+        variance of a mean (first-order autoregression). Where the surface is off they are correlated too: no more count
+        as one than make up the distance between slices, so that the scan tells as much along as across.
+        """
+        both = np.sqrt(weights * weights[self.nearest])
+        own, shared = np.sum(both * distances**2), np.sum(both * distances * distances[self.nearest])
+        r = float(np.clip(shared / max(own, np.finfo(float).tiny), 0, 1))
+        return self.most if r == 1 else min((1 + r) / (1 - r), self.most)
+
+
+def find_strokes(scan: Scan) -> Strokes | None:
+    """The contours of a scan; None where it has fewer than two slices."""
+    if scan.slices is None or len(np.unique(np.asarray(scan.slices))) < 2:
+        return None
+    points, numbers = np.asarray(scan.points, np.float64), np.asarray(scan.slices)
+    nearest, along, across = np.arange(len(points)), np.zeros(len(points)), np.zeros(len(points))
+    for number in np.unique(numbers):
+        here = np.flatnonzero(numbers == number)
+        tree = KDTree(points[here])
+        away, rows = nearest_rows(tree, points[here], min(2, len(here)))
+        nearest[here], along[here] = here[rows[:, -1]], away[:, -1]
+        across[here] = nearest_rows(KDTree(points[numbers != number]), points[here], 1)[0][:, 0]
+    spacing = float(np.median(along))
+    return Strokes(nearest, max(float(np.median(across)) / spacing, 1.0) if spacing > 0 else 1.0)
 
 
 class Border(NamedTuple):
