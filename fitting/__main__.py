@@ -96,7 +96,8 @@ def _recipe(options: argparse.Namespace) -> Recipe:
             raise ValueError(f"the scheme {type(scheme).__name__} has no h: leave --h out.")
         scheme = eqx.tree_at(lambda s: s.h, scheme, jnp.asarray(options.h, scheme.h.dtype))
     given = {name: getattr(options, name) for name in ("levels", "faces", "kind", "closed", "max_sweeps")}
-    given = {name: value for name, value in (given | {"tolerance_mm": options.tolerance}).items() if value is not None}
+    given |= {"tolerance_mm": options.tolerance, "most_points": options.points}
+    given = {name: value for name, value in given.items() if value is not None}
     if options.align is not None:
         given["pose"] = None if options.align == "none" else options.align
     if options.symmetry is not None:
@@ -360,6 +361,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--symmetry", type=float, metavar="MM", help="keep the fit as symmetric as the template, but for so much")
     add("--boundary", metavar="FILE", help="points of the curve that the open surface ends at; `scan`: the scan's rim")
     add("--tolerance", type=float, metavar="MM", help="split the control mesh until the surface is this near the scan")
+    add("--points", type=int, metavar="N", help="fit no more than so many, drawn at random; all of them are measured")
     add("--labels", nargs="+", metavar="WORD", default=[], help="only rows of a table whose label holds one of these")
     add("--scale", type=float, default=1.0, help="multiplies the scan's coordinates; 1000 for metres")
     add("--control-scale", type=float, default=1.0, help="multiplies the control mesh's coordinates")

@@ -24,7 +24,7 @@ from ._cohort_record import Cohort
 from ._conjugate_gradients import ConjugateGradients
 from ._correspondence import boundary_vertices
 from ._elements import flat, to_unknowns
-from ._fit import AT_REST, LEAST_NOISE, check, fit, given_normals, surface_moved
+from ._fit import AT_REST, check, fit, given_normals, surface_moved
 from ._free import Free, Unknowns, apply_offset, edge_length, no_offset
 from ._look import Look, Surroundings, measure, surroundings
 from ._problem import FASTEST, HOLD, LEAST_LEFT, LET_GO, SOFTER, STEP, Found, Problem, moved_to
@@ -34,6 +34,7 @@ from ._result import FitResult
 from ._robust import AbstractLoss, geman_mcclure
 from ._scan import Scan, ScanError
 from ._search import search_closest
+from ._view import LEAST_NOISE
 
 # Of the gradient, squared sums: tighter solves of a sweep, whose pairs change anyway, take longer in all.
 _SOLVED, _MOST_STEPS = 0.03, 200

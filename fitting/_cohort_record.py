@@ -10,14 +10,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 import jaxsubdiv as js
 
-from ._correspondence import boundary_vertices
-from ._fit import LEAST_NOISE
 from ._free import edge_length
-from ._look import look, surroundings
 from ._problem import Problem
 from ._recipe import Recipe
 from ._result import FitResult
 from ._scan import Scan
+from ._view import View
 
 
 @final
@@ -64,9 +62,7 @@ class Cohort:
         surface = js.RefinedSurface(surface.vertices, surface.normals, topology.faces)
         scheme = recipe.scheme if self.h is None else eqx.tree_at(lambda s: s.h, recipe.scheme, self.h[i])
         edge = float(edge_length(topology, control.vertices))
-        open_vertices = boundary_vertices(surface)
-        floor = LEAST_NOISE * edge
-        seen = look(surface, scan.without_slices(), open_vertices, surroundings(scan), edge, recipe.loss, floor)
+        seen = View(scan, surface, edge, recipe.loss).seen_from(surface)
         problem = Problem(recipe.scheme, topology, start, recipe.free, recipe.priors)
         problem.tell(self._problem.found()._replace(template=np.asarray(start.vertices, np.float64)))
         counted, ends = slice(None, int(self.sweeps[i]) + 1), optx.RESULTS

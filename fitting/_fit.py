@@ -17,27 +17,26 @@ import jaxsubdiv as js
 from jaxsubdiv._linalg import dot, unit
 from jaxsubdiv._surface import corner_weights
 
-from ._boundary import BoundaryCurve, checked_curve, held_vertices
+from ._boundary import BoundaryCurve, checked_curve
 from ._checkpoint import Checkpoint
-from ._correspondence import boundary_vertices, closest_points
+from ._correspondence import closest_points
 from ._free import Free, apply_offset, edge_length
 from ._landmarks import Landmarks, place_landmarks
-from ._look import Look, look, surroundings
+from ._look import Look
 from ._problem import Memory, Problem
 from ._recipe import Recipe
 from ._residuals import Anchors, Priors
 from ._result import FitResult
 from ._robust import AbstractLoss, geman_mcclure
 from ._scan import Scan, ScanError
-from ._shifts import find_shifts, find_strokes
+from ._shifts import find_shifts
 from ._symmetry import Symmetry, find_symmetry, symmetry_of
+from ._view import View
 
 # A start that is off by more than this part of the control mesh's size is not roughly aligned.
 _FAR = 0.05
 # Scans in metres against a mesh in mm differ by 1000; a partial scan of the anatomy by much less than this.
 _UNIT_RATIO = 20.0
-# The least noise, in control edges: a perfect scan would have none, and its points infinite weight.
-LEAST_NOISE = 1e-4
 # Movements far below a control edge are at rest, however exact the scan.
 AT_REST = 0.01
 _LEAST_MARGIN = 0.05  # of a control normal at the start; see `js.admissible_margin`
@@ -131,19 +130,10 @@ def fit(
     before = None if kept is None else kept.read()
     start = control
     surface = js.refine(scheme, topology, control)
-    open_vertices, edge = boundary_vertices(surface), float(edge_length(topology, control.vertices))
+    edge = float(edge_length(topology, control.vertices))
     curve = None if boundary is None else checked_curve(boundary, topology)
-
-    def seen_from(surface: js.RefinedSurface, here: Scan, floor: float) -> Look:
-        held = None if curve is None else held_vertices(curve, surface, edge)
-        seen = look(surface, here, open_vertices, around, edge, loss, floor, held)
-        if strokes is None:
-            return seen
-        alike = strokes.points_a_measurement(np.asarray(seen.distances), np.asarray(seen.weights))
-        return seen._replace(precisions=seen.precisions / alike)
-
-    here, around, strokes = scan.without_slices(), surroundings(scan), find_strokes(scan)
-    seen = seen_from(surface, here, LEAST_NOISE * edge)
+    view = View(scan, surface, edge, loss, curve)
+    seen = view.seen_from(surface)
     widest = float(seen.scale)  # a robust scale of the start's own error: outliers must not widen it
     _warn_if_far(float(np.median(np.abs(seen.distances))), control)
     rms, robust_rms, result = [float(seen.rms)], [float(seen.robust_rms)], optx.RESULTS.nonlinear_max_steps_reached
@@ -154,9 +144,8 @@ def fit(
         scheme, control, rms, robust_rms = _recalled(before, problem, scheme, control)
         if waiting is not None and "within" in before:
             waiting, shifts = None, waiting.recalled(before)
-            here = shifts.put_on(scan)
         surface = js.refine(scheme, topology, control)
-        seen = seen_from(surface, here, _floor(widest, len(rms) - 1, edge))
+        seen = view.seen_from(surface, _floor(widest, len(rms) - 1), shifts)
     for sweep in range(len(rms) - 1, max_sweeps):
         step, shifted = problem.step(scheme, control, seen, shifts)
         proposed = _apply(topology, scheme, control, step)
@@ -166,9 +155,8 @@ def fit(
             break
         moved = float(surface_moved(surface, refined))
         (scheme, control), surface, shifts = proposed, refined, shifted
-        floor = _floor(widest, sweep + 1, edge)
-        here = here if shifts is None else shifts.put_on(scan)
-        seen = seen_from(surface, here, floor)
+        floor = _floor(widest, sweep + 1)
+        seen = view.seen_from(surface, floor, shifts)
         rms.append(float(seen.rms))
         robust_rms.append(float(seen.robust_rms))
         if on_sweep is not None:
@@ -217,9 +205,9 @@ def fit(
 _apply = eqx.filter_jit(apply_offset)
 
 
-def _floor(widest: float, sweep: int, edge: float) -> float:
+def _floor(widest: float, sweep: int) -> float:
     """Least scale of the loss after a sweep: half of what it was after the one before."""
-    return max(widest * 0.5**sweep, LEAST_NOISE * edge)
+    return widest * 0.5**sweep
 
 
 def _recalled(

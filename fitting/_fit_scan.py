@@ -69,6 +69,7 @@ def fit_scan(
     landmarks: Landmarks | None = None,
     tolerance_mm: float | None = Recipe.tolerance_mm,
     most_faces: int = Recipe.most_faces,
+    most_points: int | None = Recipe.most_points,
     on_stage: Callable[[str], None] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     **options: Any,
@@ -87,6 +88,7 @@ def fit_scan(
             this small, or too small to be told from the noise, or the next split would make too many faces for
             `most_faces` or for two points a control vertex.
         most_faces: of the control mesh, where it is split.
+        most_points: fit no more than so many of the points, drawn at random, and measure them all then. Default: all.
         on_stage: told what begins, in a few words.
         checkpoint: a folder from which a call with the same arguments goes on where it was stopped, see `fit`; where
             the fit started is in it too, in `checkpoint_start.npz`.
@@ -100,7 +102,8 @@ def fit_scan(
     first = scheme or js.Interpolating()
     of_tables = {name: options.pop(name) for name in ("mesh_normals", "limit") if name in options}
     settings = {"faces": faces, "kind": kind, "closed": closed, "pose": pose}
-    settings |= {"tolerance_mm": tolerance_mm, "most_faces": most_faces}
+    settings |= {"tolerance_mm": tolerance_mm, "most_faces": most_faces, "most_points": most_points}
+    whole, scan = scan, scan if most_points is None else scan.drawn(most_points)
     kept = before = None
     if checkpoint is not None:
         template = None if mesh is None else (mesh.vertices, mesh.faces, mesh.normals)
@@ -148,6 +151,9 @@ def fit_scan(
         )
     if kept is not None:
         kept.remove()
+    if scan is not whole:
+        say(f"measures all {whole.n_points:,} points")
+        result = result.on(whole)
     assert result.recipe is not None
     result.recipe = dataclasses.replace(result.recipe, scheme=first, **settings)
     return ScanFit(result, start.mesh, start.alignment, start.splits, outcome)

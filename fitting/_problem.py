@@ -371,6 +371,11 @@ class Problem:
         """Tables of the control mesh."""
         return self._topology
 
+    @property
+    def curve(self) -> BoundaryCurve | None:
+        """That the surface ends at."""
+        return self._curve
+
     def found(self) -> Found:
         """What a problem made anew has to be told, to know as much as this one."""
         return Found(

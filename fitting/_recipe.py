@@ -53,7 +53,7 @@ class Recipe:
         priors: what is known of the surface beforehand.
         loss: how a point loses weight with its distance.
         max_sweeps, tolerance, landmark_deviation: see `fit`.
-        faces, kind, closed, pose, tolerance_mm, most_faces: see `fit_scan`; `fit` has no use for them.
+        faces, kind, closed, pose, tolerance_mm, most_faces, most_points: see `fit_scan`; `fit` has no use for them.
         mesh_normals, limit: see `js.build_topology`.
     """
 
@@ -71,6 +71,7 @@ class Recipe:
     pose: Kind | None = "similarity"
     tolerance_mm: float | None = None
     most_faces: int = 10_000
+    most_points: int | None = None
     mesh_normals: bool = False
     limit: bool = False
 
@@ -165,6 +166,7 @@ class Recipe:
             "pose": lambda value: _one_of("pose", value, (*get_args(Kind), None)),
             "tolerance_mm": lambda value: None if value is None else _number("tolerance_mm", value),
             "most_faces": lambda value: _checked("most_faces", value, int),
+            "most_points": lambda value: None if value is None else _checked("most_points", value, int),
             "mesh_normals": lambda value: _checked("mesh_normals", value, bool),
             "limit": lambda value: _checked("limit", value, bool),
         }

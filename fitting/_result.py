@@ -20,6 +20,7 @@ from ._refit import Refit, make_refit
 from ._report import Report, SliceShift, WorstPlace
 from ._scan import Scan
 from ._shifts import Shifts
+from ._view import View
 
 
 @final
@@ -115,6 +116,41 @@ class FitResult:
         Shifts of slices are held at what the fit found.
         """
         return make_refit(self.posterior)
+
+    def on(self, scan: Scan) -> "FitResult":
+        """The same surface, measured by another scan: by all points of the one of which a part was fitted, say.
+
+        Correspondences, distances, noise, report and uncertainty are those of its points; the convergence is that of
+        the fit. Slices keep the shifts that the fit found for their numbers.
+
+        Raises:
+            ValueError: the fit does not know its settings.
+        """
+        if self.recipe is None:
+            raise ValueError("this fit does not know its settings: only what `fit` returned can be measured again.")
+        edge = float(edge_length(self._problem.topology, self.control.vertices))
+        shifts = None if self._shifts is None or scan.slices is None else self._shifts.of(scan)
+        seen = View(scan, self.surface, edge, self.recipe.loss, self._problem.curve).seen_from(
+            self.surface, 0.0, shifts
+        )
+        return FitResult(
+            control=self.control,
+            scheme=self.scheme,
+            surface=self.surface,
+            scan=scan,
+            at=seen.at,
+            distances=np.asarray(seen.distances),
+            weights=np.asarray(seen.weights),
+            rms=np.append(self.rms[:-1], float(seen.rms)),
+            robust_rms=np.append(self.robust_rms[:-1], float(seen.robust_rms)),
+            noise=float(seen.noise),
+            result=self.result,
+            problem=self._problem,
+            seen=seen,
+            recipe=self.recipe,
+            start=self.start,
+            shifts=shifts,
+        )
 
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Write the fit into a folder, made where there is none, for `fitting.load`; and its settings.

@@ -96,6 +96,13 @@ class Scan(eqx.Module):
         """The weights, 1 each where there are none."""
         return jnp.ones_like(self.points[:, 0]) if self.weights is None else self.weights
 
+    def drawn(self, n: int) -> "Scan":
+        """At most `n` of the points, drawn at random, always the same."""
+        if n >= self.n_points:
+            return self
+        rows = np.sort(np.random.default_rng(0).choice(self.n_points, n, replace=False))
+        return Scan(**{name: None if value is None else value[rows] for name, value in vars(self).items()})
+
     def without_slices(self) -> "Scan":
         """The same points, each for itself."""
         return Scan(self.points, self.normals, self.weights, self.deviations)

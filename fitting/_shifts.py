@@ -47,6 +47,11 @@ class Shifts(NamedTuple):
         """The same slices, shifted by these."""
         return self._replace(within=np.einsum("sx,sjx->sj", vectors, self.planes))
 
+    def of(self, scan: Scan) -> "Shifts":
+        """The same shifts, of the slices of another scan that have the same numbers."""
+        row = {number: i for i, number in enumerate(self.slices.tolist())}
+        return self._replace(of_point=np.array([row.get(number, -1) for number in np.asarray(scan.slices).tolist()]))
+
     def memory(self) -> dict[str, np.ndarray]:
         """What `recalled` needs, to go on from here."""
         return {"within": self.within, "shift_step": self.step, "shift_hold": self.hold}

@@ -81,6 +81,27 @@ def test_fit_that_was_stopped_after_a_split_goes_on_there(tmp_path):
         np.testing.assert_array_equal(found, expected)
 
 
+def test_part_of_the_points_is_fitted_and_all_are_measured():
+    mesh, scan = mesh_and_scan()
+    how, told = {"levels": 1, "pose": None, "throw": False, "max_sweeps": 12}, []
+    part = fit_scan(scan.drawn(N_POINTS // 2), mesh, **how).result
+    found = fit_scan(scan, mesh, most_points=N_POINTS // 2, on_stage=told.append, **how).result
+    assert told[-1] == f"measures all {N_POINTS:,} points" and part.scan.n_points == N_POINTS // 2
+    np.testing.assert_array_equal(found.control.vertices, part.control.vertices)
+    assert found.report().n_points == len(found.distances) == len(found.inliers) == N_POINTS
+    np.testing.assert_array_equal(found.scan.points, scan.points)
+    rows = np.flatnonzero(np.isin(np.asarray(scan.points)[:, 0], np.asarray(part.scan.points)[:, 0]))
+    np.testing.assert_allclose(found.distances[rows], part.distances, atol=1e-12)
+    # Every point of the whole scan tells something of the surface.
+    assert np.median(found.uncertainty().surface) < 0.85 * np.median(part.uncertainty().surface)
+    assert found.recipe.most_points == N_POINTS // 2
+    assert fitting.Recipe.from_json(found.recipe.to_json()).most_points == N_POINTS // 2
+    again = found.on(part.scan)
+    np.testing.assert_allclose(again.distances, part.distances, atol=1e-12)
+    np.testing.assert_allclose(again.uncertainty().surface, part.uncertainty().surface, rtol=1e-6)
+    assert scan.drawn(10**6) is scan and len(np.unique(scan.drawn(50).points, axis=0)) == 50
+
+
 def test_splitting_stops_at_the_noise():
     mesh, scan = mesh_and_scan()
     found = fit_scan(scan, mesh, levels=1, pose=None, max_sweeps=0, throw=False).result
