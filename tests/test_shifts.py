@@ -110,7 +110,7 @@ def test_points_of_a_stroke_count_as_few(monkeypatch):
     stroke = 0.8 * np.cos(waves * angle[:, None] + phases).sum(axis=1, keepdims=True)  # about 1.7 mm
     drawn = Scan(points + stroke * across / np.linalg.norm(across, axis=1, keepdims=True), slices=slices)
     few = fit_slices(drawn, free=Free(shifts=False))
-    monkeypatch.setattr("fitting._fit.find_strokes", lambda scan: None)
+    monkeypatch.setattr("fitting._view.find_strokes", lambda scan: None)
     many = fit_slices(drawn, free=Free(shifts=False))
     assert off_truth(few) < 0.9 * off_truth(many)
     assert few.uncertainty().surface.mean() > 1.3 * many.uncertainty().surface.mean()
