@@ -24,6 +24,7 @@ from ._residuals import Pairs, Rows, Start, signed_distances, surface_and_priors
 _ROWS_A_BLOCK = 32
 _PAIRS_AT_ONCE = 65_536  # bounds the memory to a few hundred MB, however large the scan is
 _PATCHES_AT_ONCE = 512  # likewise
+_ONE_THREAD = 1 << 18  # multiplications of a product that OpenBLAS leaves to one
 _WRONG = 1e-3  # of a derivative: far more than rounding in float32, far less than a forgotten control vertex
 
 
@@ -207,7 +208,14 @@ def normal_matrix(
     inside = place < (first + counts)[owner][:, None]
     rows = order[np.where(inside, place, 0)]
     scaled = by[rows] * (np.sqrt(weights)[rows] * inside)[..., None]
-    return _summed(elements, owner, np.matmul(scaled.transpose(0, 2, 1), scaled))
+    return _summed(elements, owner, _products(scaled.transpose(0, 2, 1), scaled))
+
+
+def _products(a: Float[np.ndarray, "b m k"], b: Float[np.ndarray, "b k n"]) -> Float[np.ndarray, "b m n"]:
+    """Products of many small matrices, a few columns at a time: over a size OpenBLAS gives each to all cores, whose
+    threads then mostly wait for one another (on busy cores ten times as long)."""
+    columns = max(_ONE_THREAD // (a.shape[1] * a.shape[2]), 1)
+    return np.concatenate([np.matmul(a, b[..., i : i + columns]) for i in range(0, b.shape[2], columns)], axis=2)
 
 
 def _summed(
@@ -254,7 +262,7 @@ def equations_of_many(
             n * width * width,
         ).reshape(n, width, width)
         by = np.asarray(found.by_surface[those], np.float64).transpose(0, 1, 3, 2).reshape(n, width, d)
-        values += _summed(elements, those, np.matmul(by.transpose(0, 2, 1), np.matmul(inner, by)))
+        values += _summed(elements, those, _products(by.transpose(0, 2, 1), _products(inner, by)))
         by_unknowns = np.matmul(sides.reshape(n, 1, width), by)
         gradient += np.bincount(elements.columns[those].ravel(), by_unknowns.ravel(), elements.n + 1)
     return values, gradient[:-1]
