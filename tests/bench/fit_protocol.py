@@ -75,6 +75,7 @@ CASES = {
     "rotation-30": Case(rotation=30.0),
     "scale-0.8": Case(scale=0.8),
     "scale-1.2": Case(scale=1.2),
+    "no-noise": Case(points=80_000, sigma=0.01, outliers=0.0, hole=0.0),  # what the mesh itself leaves
     "bad-start": Case(warp=12.0, rotation=30.0, scale=0.8),
     "cortex": Case(CORTEX, vertices=CORTEX_VERTICES, points=40_000, sigma=0.25, hole=20.0, smoothing=0, warp=2.0),
 }
