@@ -55,12 +55,8 @@ class FitResult:
         scheme: js.AbstractScheme,
         surface: js.RefinedSurface,
         scan: Scan,
-        at: js.SurfacePoint,
-        distances: Float[np.ndarray, "p"],
-        weights: Float[np.ndarray, "p"],
         rms: Float[np.ndarray, "sweeps"],
         robust_rms: Float[np.ndarray, "sweeps"],
-        noise: float,
         result: optx.RESULTS,
         problem: Problem,
         seen: Look,
@@ -72,12 +68,12 @@ class FitResult:
         self.scheme = scheme
         self.surface = surface
         self.scan = scan
-        self.at = at
-        self.distances = distances
-        self.weights = weights
+        self.at = seen.at
+        self.distances = np.asarray(seen.distances)
+        self.weights = np.asarray(seen.weights)
         self.rms = rms
         self.robust_rms = robust_rms
-        self.noise = noise
+        self.noise = float(seen.noise)
         self.result = result
         self.recipe = recipe
         self.start = start
@@ -138,12 +134,8 @@ class FitResult:
             scheme=self.scheme,
             surface=self.surface,
             scan=scan,
-            at=seen.at,
-            distances=np.asarray(seen.distances),
-            weights=np.asarray(seen.weights),
             rms=np.append(self.rms[:-1], float(seen.rms)),
             robust_rms=np.append(self.robust_rms[:-1], float(seen.robust_rms)),
-            noise=float(seen.noise),
             result=self.result,
             problem=self._problem,
             seen=seen,

@@ -206,6 +206,7 @@ def test_recipe_of_every_loss_and_option_comes_back_from_json(loss):
         pose=None,
         tolerance_mm=0.4,
         most_faces=900,
+        most_points=3_000,
         mesh_normals=True,
     )
     text = recipe.to_json()
