@@ -24,8 +24,12 @@ from unittest.mock import patch
 PARTS = {
     "closest points": ["fitting._look.closest_points"],
     "weights, noise": ["fitting._look.measure"],
-    "derivatives": ["fitting._problem.differentiate"],
-    "normal equations": ["fitting._problem.normal_matrix", "fitting._problem.times_transposed"],
+    "derivatives": ["fitting._problem.differentiate", "fitting._problem.differentiate_distances"],
+    "normal equations": [
+        "fitting._problem.equations_of_many",
+        "fitting._problem.normal_matrix",
+        "fitting._problem.times_transposed",
+    ],
     "factorisation": ["fitting._problem.factorise"],
     "smoothness by the evidence": ["fitting._problem.next_precision", "fitting._problem.jacobian"],
     "degrees of freedom": ["fitting._problem.Problem._count_determined"],
@@ -33,7 +37,7 @@ PARTS = {
     "analysis, once a fit": [
         "fitting._problem.Problem._analyse",
         "fitting._problem.Problem.__init__",
-        "fitting._fit.surroundings",
+        "fitting._view.surroundings",
     ],
     "step and solution": ["fitting._problem.Problem.step"],
 }
