@@ -183,9 +183,8 @@ class Problem:
         self, scheme: js.AbstractScheme, control: js.Control, seen: Look, shifts: Shifts | None
     ) -> _Equations:
         start = self.start(scheme, control)
-        if self._elements is None:
-            self._elements = self._analyse(start)
-        elements, found = self._elements, self._differentiate(start)
+        found = self._analyse(start) if self._elements is None else self._differentiate(start)
+        elements = self.elements
         data, gradient, border = self._of_distances(found, seen, shifts)
         rows, by_priors = jax.tree.map(lambda values: np.asarray(values, np.float64), (found.rows, found.by_rows))
         if not len(self._precision):
@@ -284,11 +283,8 @@ class Problem:
         """The trace of the scan's part of the posterior, by random vectors."""
         probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(factor.shape[0], _PROBES))
         of_data = self._matrix(found.data, np.zeros(len(self.is_free)))
-        of_data = (
-            of_data
-            if found.border is None
-            else found.border.around(of_data, 0.0, np.zeros((int(self.is_free.sum()), 3)), 0.0)
-        )
+        if found.border is not None:
+            of_data = found.border.around(of_data, 0.0, np.zeros((int(self.is_free.sum()), 3)), 0.0)
         self.determined = max(float(np.mean(np.sum(probes * factor.solve(of_data @ probes), axis=0))), 0.0)
 
     def _hold_what_turns_back(self, step: Float[np.ndarray, "n"]) -> None:
@@ -314,13 +310,13 @@ class Problem:
             self._precision = np.maximum(self._precision, given)
             self.annealed = bool((self._precision <= given).all())
 
-    def _analyse(self, start: Start) -> Elements:
-        """Which unknowns belong to which face: as few rings of faces as explain all derivatives."""
+    def _analyse(self, start: Start) -> Derivatives:
+        """Find which unknowns belong to which face: so few rings that explain all derivatives, which it returns."""
         for rings in range(1, _MOST_RINGS + 1):
             self._elements = find_elements(self._topology, self.free, start, rings)
             found = self._differentiate(start)
             if not forgets_some(self._elements, self._patches, found, self._row_faces(start)):
-                return self._elements
+                return found
         raise ValueError(
             f"a face of {type(start.scheme).__name__} depends on control vertices more than {_MOST_RINGS} rings of "
             "faces away: the fit has no sparse derivatives to work with."
@@ -392,7 +388,7 @@ class Problem:
 
     def recall(self, memory: Memory, scheme: js.AbstractScheme, control: js.Control) -> None:
         """Go on where another problem was, that made its first step from this scheme and control."""
-        self._elements = self._analyse(self.start(scheme, control))
+        self._analyse(self.start(scheme, control))
         self._precision, self.determined, self.annealed, self._hold, self._last_step = memory
 
     @property
@@ -420,9 +416,6 @@ class Problem:
         whole = (whole + sp.diags_array(diagonal)).tocsc()
         whole = whole if tied is None else (whole + tied).tocsc()
         return whole if self.is_free.all() else whole[self.is_free][:, self.is_free].tocsc()
-
-    def _trace(self, values: np.ndarray) -> float:
-        return float(self._matrix(values, np.zeros(self.elements.n)).diagonal().sum())
 
 
 def factorise(matrix: sp.csc_array) -> SuperLU:
