@@ -20,6 +20,7 @@ from jaxsubdiv._surface import corner_weights
 from ._boundary import BoundaryCurve, checked_curve
 from ._checkpoint import Checkpoint
 from ._correspondence import closest_points
+from ._folds import unfolded_start
 from ._free import Free, apply_offset, edge_length
 from ._landmarks import Landmarks, place_landmarks
 from ._look import Look
@@ -110,7 +111,8 @@ def fit(
             the fit has ended.
 
     Raises:
-        UserWarning: the start is so far off that the fit will hardly find its way.
+        UserWarning: the start is so far off that the fit will hardly find its way; or faces of the control mesh lie
+            upside down on their neighbours, and the fit starts with them turned back.
         ScanError: the sizes of scan and control mesh differ as by a wrong unit, or there are too few points.
         ValueError: the topology has no levels, or does not fit the control; the control mesh has no symmetry, though
             the priors ask for it; the checkpoint is of another fit.
@@ -120,6 +122,7 @@ def fit(
     # Made here and not in the signature: arrays made while a module loads would settle JAX's device and precision.
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
     symmetry = _partners(symmetry, priors, topology, control)
+    control = unfolded_start(topology, control, free)
     control = js.Control(control.vertices, given_normals(topology, control))
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
     settings["landmark_deviation"] = landmark_deviation
@@ -161,12 +164,13 @@ def fit(
         robust_rms.append(float(seen.robust_rms))
         if on_sweep is not None:
             on_sweep(Sweep(sweep + 1, robust_rms[-1], moved))
-        annealed = problem.annealed and floor <= seen.scale and waiting is None
+        at_noise = floor <= max(float(seen.noise), view.least_scale)
+        annealed = problem.annealed and at_noise and waiting is None
         at_rest = tolerance * max(_uncertainty(seen, control), AT_REST * edge)
         if annealed and max(moved, abs(robust_rms[-1] - robust_rms[-2])) <= at_rest:
             result = optx.RESULTS.successful
             break
-        if waiting is not None and floor <= seen.scale:
+        if waiting is not None and at_noise:
             # Not before, where the start is off and everything would be taken for shifts; nor when the surface has come
             # to rest, for it has bent to the slices that are off.
             waiting, shifts = None, waiting

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse.linalg import SuperLU, splu
 
 import jaxsubdiv as js
@@ -31,6 +31,7 @@ from ._elements import (
     to_unknowns,
 )
 from ._evidence import Solve, neighbourhoods, next_precision
+from ._folds import Folds
 from ._free import Free, Unknowns, edge_length, no_offset
 from ._look import Look
 from ._residuals import (
@@ -51,6 +52,8 @@ from ._symmetry import Mirror, Symmetry, Ties, mirror_at, ties
 # vertex that turns back is held faster, and one that goes on is let go again: where the surface cannot follow the scan
 # (an ear in a coarse mesh) points change sides from sweep to sweep, and exact steps would go to and fro for ever.
 STEP, HOLD, LET_GO, FASTEST = 0.25, 8.0, 0.7, 1e6
+_TRIES = 6  # of a step that turns faces upside down: their vertices are held faster each time
+_STIFFER = 10.0  # the bend prior's strength in the first sweep, over that of the template's own bends
 SOFTER = 0.3  # factor of the bend prior from sweep to sweep, down to its own strength
 _SETTLED = 0.3  # mean change of the logarithm of the bend prior's strength in a sweep
 LEAST_LEFT = 0.1  # of the degrees of freedom: what is less says that the scan has too few points
@@ -133,6 +136,7 @@ class Problem:
         self._faces = prior_faces(scheme, topology, anchors, owner, 0 if masks.h is None else masks.h.size)
         self._edges, self._bend_edges = control_edges(topology), bend_edges(topology)
         self._around = neighbourhoods(topology)
+        self._folds = Folds(topology)
         self._edge = float(edge_length(topology, control.vertices))
         self._elements: Elements | None = None
         self._precision: Float[np.ndarray, "f"] = np.zeros(0)  # of the bends, a control face; found in the first sweep
@@ -150,20 +154,19 @@ class Problem:
         It also finds the next strength of the bend prior.
         """
         found = self._equations(scheme, control, seen, shifts)
-        held = factorise(self._whole(found, self._hold, 0.0 if shifts is None else np.repeat(shifts.hold, 2)))
-        n, step = int(self.is_free.sum()), np.zeros(self.elements.n)
-        of_shifts = np.zeros(0) if found.border is None else found.border.gradient
-        sides = np.zeros(held.shape[0])
-        sides[: n + len(of_shifts)] = np.append(found.gradient[self.is_free], of_shifts)
-        solution = -held.solve(sides)
-        step[self.is_free] = solution[:n]
-        if found.ties is not None:
-            step = found.ties.with_plane(step, _first_part_of(held), self.is_free)
+        hold, tries = self._hold, 0
+        while True:
+            held = factorise(self._whole(found, hold, 0.0 if shifts is None else np.repeat(shifts.hold, 2)))
+            step, of_shifts = self._solution(found, held)
+            offset = to_unknowns(jnp.asarray(step), self._zero)
+            rash, tries = self._rash(control, offset), tries + 1
+            if tries == _TRIES or not rash.any():
+                break
+            hold = self._held(hold, np.where(rash, HOLD, 1.0))  # for this sweep alone
         if shifts is not None:
-            within = solution[n : n + len(of_shifts)].reshape(-1, 2)
-            shifts = self._hold_what_shifts_back(shifts, within)
+            shifts = self._hold_what_shifts_back(shifts, of_shifts.reshape(-1, 2))
         # What is held says nothing of what the scan determines.
-        slack = shifts is None and not np.any(self._hold > self.loose)
+        slack = shifts is None and not np.any(hold > self.loose)
         loose = held if slack else factorise(self._whole(found, self.loose))
         self._hold_what_turns_back(step)
         self._count_determined(found, loose)
@@ -171,7 +174,7 @@ class Problem:
             self._find_bend(found, step, loose)
         else:
             self._set_bend(self._precision * SOFTER)
-        return to_unknowns(jnp.asarray(step), self._zero), shifts
+        return offset, shifts
 
     def precision_matrix(
         self, scheme: js.AbstractScheme, control: js.Control, seen: Look, shifts: Shifts | None = None
@@ -188,8 +191,8 @@ class Problem:
         data, gradient, border = self._of_distances(found, seen, shifts)
         rows, by_priors = jax.tree.map(lambda values: np.asarray(values, np.float64), (found.rows, found.by_rows))
         if not len(self._precision):
-            # As smooth as the template, to begin with.
-            self._set_bend(np.full(len(elements.columns), 1 / max(float(np.mean(np.square(rows.bend))), _TINY)))
+            first = 1 / max(float(np.mean(np.square(rows.bend))) / _STIFFER, _TINY)
+            self._set_bend(np.full(len(elements.columns), first))
         weights, of_priors = np.concatenate(self.prior_precisions()), self._row_faces(start)
         gradient += times_transposed(elements, by_priors, weights * np.concatenate(rows[1:]), of_priors)
         prior = normal_matrix(elements, by_priors, weights, of_priors)
@@ -287,14 +290,41 @@ class Problem:
             of_data = found.border.around(of_data, 0.0, np.zeros((int(self.is_free.sum()), 3)), 0.0)
         self.determined = max(float(np.mean(np.sum(probes * factor.solve(of_data @ probes), axis=0))), 0.0)
 
+    def _solution(self, found: _Equations, factor: SuperLU) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "k"]]:
+        """The step of the unknowns, and of the shifts."""
+        n, step = int(self.is_free.sum()), np.zeros(self.elements.n)
+        of_shifts = np.zeros(0) if found.border is None else found.border.gradient
+        sides = np.zeros(factor.shape[0])
+        sides[: n + len(of_shifts)] = np.append(found.gradient[self.is_free], of_shifts)
+        solution = -factor.solve(sides)
+        step[self.is_free] = solution[:n]
+        if found.ties is not None:
+            step = found.ties.with_plane(step, _first_part_of(factor), self.is_free)
+        return step, solution[n : n + len(of_shifts)]
+
+    def _rash(self, control: js.Control, offset: Unknowns) -> Bool[np.ndarray, "v"]:
+        """Vertices of control faces that a step would turn upside down."""
+        if offset.vertices is None:
+            return np.zeros(len(self._template), bool)
+        before, after = (np.asarray(x, np.float64) for x in (control.vertices, control.vertices + offset.vertices))
+        return self._folds.corners_of(self._folds.turned_over(after) & ~self._folds.turned_over(before))
+
     def _hold_what_turns_back(self, step: Float[np.ndarray, "n"]) -> None:
-        width = (len(step) - len(self._faces.h)) // max(len(self._template), 1)
-        n = width * len(self._template)
-        agree = np.sum((step * self._last_step)[:n].reshape(-1, width), axis=1) if width else np.zeros(0)
-        factor = np.ones(len(step))
-        factor[:n] = np.repeat(np.where(agree < 0, HOLD, LET_GO), width)
-        self._hold = np.clip(self._hold * factor, self.loose, FASTEST * self.loose)
+        n = self._vertex_width * len(self._template)
+        agree = np.sum((step * self._last_step)[:n].reshape(len(self._template), self._vertex_width), axis=1)
+        self._hold = self._held(self._hold, np.where(agree < 0, HOLD, LET_GO))
         self._last_step = step
+
+    def _held(self, hold: Float[np.ndarray, "n"], faster: Float[np.ndarray, "v"]) -> Float[np.ndarray, "n"]:
+        """What holds the unknowns, where that of vertices and their normals changes by a factor."""
+        of_others = np.ones(len(hold) - self._vertex_width * len(faster))
+        by = np.concatenate([np.repeat(faster, self._vertex_width), of_others])
+        return np.clip(hold * by, self.loose, FASTEST * self.loose)
+
+    @property
+    def _vertex_width(self) -> int:
+        """Number of unknowns that each control vertex has, with its normal."""
+        return (len(self._hold) - len(self._faces.h)) // max(len(self._template), 1)
 
     def _hold_what_shifts_back(self, shifts: Shifts, step: Float[np.ndarray, "s 2"]) -> Shifts:
         back = np.sum(step * shifts.step, axis=1) < 0

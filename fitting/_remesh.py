@@ -299,7 +299,7 @@ def relaxed(mesh: Coarse, dense: Dense, rounds: int = _RELAXED) -> Coarse:
     rim = sides.edges[np.bincount(sides.edge) == 1]
     on_rim = np.zeros(n, bool)
     on_rim[rim] = True
-    inner, along = _averages(sides.edges, n), _averages(rim, n)
+    inner, along = averages(sides.edges, n), averages(rim, n)
     normals, tree = dense.normals(), KDTree(dense.vertices)
     dense_rim = _smooth_rim(dense) if on_rim.any() else np.zeros((0, 3))
     edge_of_rim = KDTree(dense_rim) if len(dense_rim) else None
@@ -317,7 +317,7 @@ def _smooth_rim(dense: Dense) -> Float[np.ndarray, "r 3"]:
     sides = half_edges({3: dense.faces, 4: np.zeros((0, 4), np.int64)})
     rim = sides.edges[np.bincount(sides.edge) == 1]
     used, at = np.unique(rim, return_inverse=True)
-    along = _averages(at.reshape(-1, 2), len(used))
+    along = averages(at.reshape(-1, 2), len(used))
     x = dense.vertices[used]
     for _ in range(_SOFTENED):
         x = x + 0.5 * (along @ x - x)
@@ -331,7 +331,8 @@ def _onto(
     return x - np.einsum("nx,nx->n", x - vertices[row], normals[row])[:, None] * normals[row]
 
 
-def _averages(edges: Int[np.ndarray, "e 2"], n: int) -> csr_matrix:
+def averages(edges: Int[np.ndarray, "e 2"], n: int) -> csr_matrix:
+    """Takes rows of the vertices to the means of those that edges tie them to."""
     both = np.concatenate([edges, edges[:, ::-1]]).T
     matrix = coo_matrix((np.ones(both.shape[1]), (both[0], both[1])), shape=(n, n)).tocsr()
     count = np.maximum(np.asarray(matrix.sum(axis=1)).ravel(), 1)
