@@ -17,8 +17,8 @@ import jaxsubdiv as js
 
 Solve = Callable[[Float[np.ndarray, "n k"]], Float[np.ndarray, "n k"]]
 
-_PROBES = 24  # random vectors of a trace; a face's neighbourhood averages over hundreds of rows besides
-_SHARE_OF_ALL = 0.05  # how much the whole surface counts beside a face's neighbourhood
+_PROBES = 24  # random vectors of a trace; a face and its neighbourhood average over a hundred rows besides
+_SHARE_OF_ALL = 0.05  # how much the whole surface counts beside a face
 _TINY = np.finfo(float).tiny
 _LARGEST_CHANGE = 5.0  # of a strength in one sweep: what it depends on is known for the present one only
 
@@ -59,11 +59,13 @@ def next_precision(
     sides = by.T @ (probes * root[:, None])
     free = root * np.mean(probes * (by @ (solve_prior(sides) - solve_posterior(sides))), axis=1)
     n = len(precision)
-    determined = np.maximum(around @ np.bincount(face, free, n), 0)
-    left = around @ np.bincount(face, bends**2, n)
+    determined = np.maximum(np.bincount(face, free, n), 0)
+    left = np.bincount(face, bends**2, n)
     # Where the scan says nothing, in a hole, the surface is as smooth as elsewhere.
     shared = _SHARE_OF_ALL * determined.mean()
     usual = np.exp(np.average(np.log(precision), weights=determined + shared + _TINY))
     found = (shared + determined) / np.maximum(shared / usual + left, _TINY)
     changed = precision * np.clip(found / precision, 1 / _LARGEST_CHANGE, _LARGEST_CHANGE)
+    # Means of the logarithms: means of the bends would be those of the one ear or rim in a neighbourhood, and leave
+    # noise in all of it.
     return np.exp(around @ np.log(changed))
