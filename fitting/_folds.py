@@ -8,7 +8,7 @@ import warnings
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 import jaxsubdiv as js
 from jaxsubdiv._errors import name_rows
@@ -34,17 +34,21 @@ class Folds:
 
     def turned_over(self, vertices: Float[np.ndarray, "v 3"]) -> Bool[np.ndarray, "f"]:
         """Faces that are folded onto the faces beside them at most of their edges; triangles, then quads."""
+        edges, back = (self._per_face(which) for which in (np.ones(len(self._beside), bool), self._folded(vertices)))
+        return (back >= 2) & (2 * back > edges)  # of two faces that meet at one edge, either may be the one
+
+    def _folded(self, vertices: Float[np.ndarray, "v 3"]) -> Bool[np.ndarray, "e"]:
+        """Edges at which two faces are folded onto each other."""
         a, b, c = (vertices[corners] for corners in self._faces[3].T)
         p, q, r, s = (vertices[corners] for corners in self._faces[4].T)
         normals = np.concatenate([np.cross(b - a, c - a), np.cross(r - p, s - q)])
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
-        one, other = self._beside.T
-        folded = np.sum(normals[one] * normals[other], axis=1) < _FOLDED
-        edges, back = (
-            np.bincount(one[of], minlength=len(normals)) + np.bincount(other[of], minlength=len(normals))
-            for of in (slice(None), folded)
-        )
-        return (back >= 2) & (2 * back > edges)  # of two faces that meet once, either may be the one
+        one, other = normals[self._beside.T]
+        return np.sum(one * other, axis=1) < _FOLDED
+
+    def _per_face(self, edges: Bool[np.ndarray, "e"]) -> Int[np.ndarray, "f"]:
+        """How many of these edges each face has."""
+        return np.bincount(self._beside[edges].ravel(), minlength=sum(map(len, self._faces.values())))
 
     def corners_of(self, faces: Bool[np.ndarray, "f"]) -> Bool[np.ndarray, "v"]:
         """The vertices of these faces."""
@@ -60,16 +64,20 @@ class Folds:
         on_boundary = np.zeros(self._n_vertices, bool)
         on_boundary[self._sides.edges[np.bincount(self._sides.edge) == 1]] = True  # its middles lie within the mesh
         x = best = vertices
-        turned = self.turned_over(x)
-        fewest = np.sum(turned)
+        moving, fewest = np.zeros(self._n_vertices, bool), len(self._beside) + 1
         for _ in range(_ROUNDS):
-            moving = self.corners_of(turned) & may_move & ~on_boundary
-            if not moving.any():
+            folded = self.corners_of(self._per_face(self._folded(x)) > 0)
+            if np.sum(folded) < fewest:
+                best, fewest = x, np.sum(folded)
+            if moving.any():
+                # Those beside them too: where a vertex has come to lie on the far side of a thin triangle, that turned.
+                hurt = folded & (around @ moving > 0)
+            else:
+                hurt = self.corners_of(self.turned_over(x))
+            if not hurt.any():
                 break
+            moving |= hurt & may_move & ~on_boundary
             x = np.where(moving[:, None], 0.5 * (x + around @ x), x)
-            turned = self.turned_over(x)
-            if np.sum(turned) < fewest:
-                best, fewest = x, np.sum(turned)
         return best
 
 
