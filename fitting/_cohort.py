@@ -24,7 +24,7 @@ from ._cohort_record import Cohort
 from ._conjugate_gradients import ConjugateGradients
 from ._correspondence import boundary_vertices
 from ._elements import flat, to_unknowns
-from ._fit import AT_REST, check, fit, given_normals, surface_moved
+from ._fit import AT_REST, check, fit, sound_start, surface_moved
 from ._free import Free, Unknowns, apply_offset, edge_length, no_offset
 from ._look import Look, Surroundings, measure, surroundings
 from ._problem import FASTEST, HOLD, LEAST_LEFT, LET_GO, SOFTER, STEP, Found, Problem, moved_to
@@ -122,7 +122,8 @@ def fit_cohort(
             a time is as fast, and stops when it has converged.
 
     Warns:
-        UserWarning: some fits did not converge; it names them, and `Cohort.converged` has them.
+        UserWarning: some fits did not converge; it names them, and `Cohort.converged` has them. Or faces of a control
+            mesh lie upside down, see `fit`.
 
     Raises:
         ScanError: a scan cannot be fitted, or has slices that are free to move; the text names it by its number.
@@ -147,10 +148,14 @@ def fit_cohort(
                 )
         except ScanError as error:
             raise ScanError(f"scan {i}: {error}") from error
+    sound = {}
+    for control in controls:  # mostly the same one for all
+        if id(control) not in sound:
+            sound[id(control)] = sound_start(topology, control, free)
+    controls = [sound[id(control)] for control in controls]
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
     if priors.bend is None and pilot is None:
         pilot = fit(scheme, topology, controls[0], scans[0], throw=False, **settings)
-    controls = [js.Control(one.vertices, given_normals(topology, one)) for one in controls]
     recipe = Recipe.of(scheme, topology, **settings)
     problem = Problem(scheme, topology, controls[0], free, priors)
     problem.tell(_strength(problem, priors, pilot))

@@ -122,8 +122,7 @@ def fit(
     # Made here and not in the signature: arrays made while a module loads would settle JAX's device and precision.
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
     symmetry = _partners(symmetry, priors, topology, control)
-    control = unfolded_start(topology, control, free)
-    control = js.Control(control.vertices, given_normals(topology, control))
+    control = sound_start(topology, control, free)
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
     settings["landmark_deviation"] = landmark_deviation
     recipe = Recipe.of(scheme, topology, **settings)
@@ -265,6 +264,12 @@ def _anchors(
     points = jnp.asarray(placed.scan[counted], dtype)
     deviations = jnp.asarray(deviation / np.sqrt(placed.weights[counted]), dtype)
     return Anchors(points, at.face, corners, weights, deviations)
+
+
+def sound_start(topology: js.Topology, control: js.Control, free: Free) -> js.Control:
+    """The control mesh without faces upside down, with unit normals that fold nothing."""
+    control = unfolded_start(topology, control, free)
+    return js.Control(control.vertices, given_normals(topology, control))
 
 
 def given_normals(topology: js.Topology, control: js.Control) -> Float[Array, "v 3"]:

@@ -56,29 +56,29 @@ class Folds:
         corners[self._sides.start[faces[self._sides.face]]] = True
         return corners
 
-    def unfolded(
-        self, vertices: Float[np.ndarray, "v 3"], may_move: Bool[np.ndarray, "v"]
-    ) -> Float[np.ndarray, "v 3"]:
+    def unfolded(self, vertices: Float[np.ndarray, "v 3"], may_move: Bool[np.ndarray, "v"]) -> Float[np.ndarray, "v 3"]:
         """The vertices; those of faces upside down between their neighbours, as far as that turns faces back."""
         around = averages(self._sides.edges, self._n_vertices)
         on_boundary = np.zeros(self._n_vertices, bool)
         on_boundary[self._sides.edges[np.bincount(self._sides.edge) == 1]] = True  # its middles lie within the mesh
         x = best = vertices
-        moving, fewest = np.zeros(self._n_vertices, bool), len(self._beside) + 1
+        hurt, moving = self.corners_of(self.turned_over(x)), np.zeros(self._n_vertices, bool)
+        fewest = np.sum(self._corners_of_folds(x))
         for _ in range(_ROUNDS):
-            folded = self.corners_of(self._per_face(self._folded(x)) > 0)
+            moving |= hurt & may_move & ~on_boundary
+            if not (hurt & moving).any():
+                break
+            x = np.where(moving[:, None], 0.5 * (x + around @ x), x)
+            folded = self._corners_of_folds(x)
             if np.sum(folded) < fewest:
                 best, fewest = x, np.sum(folded)
-            if moving.any():
-                # Those beside them too: where a vertex has come to lie on the far side of a thin triangle, that turned.
-                hurt = folded & (around @ moving > 0)
-            else:
-                hurt = self.corners_of(self.turned_over(x))
-            if not hurt.any():
-                break
-            moving |= hurt & may_move & ~on_boundary
-            x = np.where(moving[:, None], 0.5 * (x + around @ x), x)
+            # Those beside them too: a vertex may lie on the far side of a thin triangle that is itself turned.
+            hurt = folded & (moving | (around @ moving > 0))
         return best
+
+    def _corners_of_folds(self, vertices: Float[np.ndarray, "v 3"]) -> Bool[np.ndarray, "v"]:
+        """The vertices of all faces that have a folded edge."""
+        return self.corners_of(self._per_face(self._folded(vertices)) > 0)
 
 
 def unfolded_start(topology: js.Topology, control: js.Control, free: Free) -> js.Control:
@@ -95,6 +95,6 @@ def unfolded_start(topology: js.Topology, control: js.Control, free: Free) -> js
         f"{name_rows(np.flatnonzero(turned))} ({np.sum(turned)} of {len(turned)}, triangles counted before quads). "
         f"The fit starts with their vertices moved between their neighbours.{doubt} Mend them in the control mesh, "
         "or make it again.",
-        stacklevel=3,
+        stacklevel=4,
     )
     return js.Control(jnp.asarray(mended, control.vertices.dtype), control.normals)

@@ -122,6 +122,25 @@ def test_fit_from_a_face_upside_down_warns_and_finds_the_surface():
     assert found.distances.std() < 0.1 * float(np.abs(pushed_out(mesh) - mesh.vertices).max())
 
 
+@pytest.mark.filterwarnings("ignore:2 of 2 fits did not converge")
+def test_cohort_starts_without_faces_upside_down_too():
+    mesh = with_three_neighbours()
+    topology = js.build_topology(mesh, js.Interpolating(), 1)
+    control = js.ControlMesh(pushed_out(mesh), mesh.faces).control()
+    with pytest.warns(UserWarning, match="upside down") as told:
+        found = fitting.fit_cohort(
+            js.Interpolating(),
+            topology,
+            control,
+            [scan_of_the_sheet()] * 2,
+            priors=fitting.Priors(bend=0.3),
+            max_sweeps=2,
+        )
+    assert sum("upside down" in str(warning.message) for warning in told) == 1
+    for vertices in np.asarray(found.control.vertices):
+        assert not folds(mesh).turned_over(vertices).any()
+
+
 @pytest.mark.filterwarnings("ignore:faces of the control mesh that lie upside down")
 def test_step_that_turns_faces_over_is_taken_again_and_shorter(monkeypatch):
     mesh, turned = with_three_neighbours(), []
