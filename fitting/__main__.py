@@ -30,7 +30,6 @@ from ._landmarks import Landmarks, match_landmarks, read_landmarks
 from ._page import write_page
 from ._picture import draw_fit, surface_distances
 from ._recipe import Recipe, load_recipe
-from ._residuals import Priors
 from ._result import FitResult
 from ._saved import load
 from ._scan import Scan, read_scan
@@ -100,8 +99,9 @@ def _recipe(options: argparse.Namespace) -> Recipe:
     given = {name: value for name, value in given.items() if value is not None}
     if options.align is not None:
         given["pose"] = None if options.align == "none" else options.align
-    if options.symmetry is not None:
-        given["priors"] = eqx.tree_at(lambda p: p.symmetry, recipe.priors, Priors(symmetry=options.symmetry).symmetry)
+    asked = {name: getattr(options, name) for name in ("symmetry", "likeness") if getattr(options, name) is not None}
+    if asked:
+        given["priors"] = dataclasses.replace(recipe.priors, **asked)
     return dataclasses.replace(recipe, scheme=scheme, **given)
 
 
@@ -223,8 +223,9 @@ def _inputs(scan: Path | None, options: argparse.Namespace) -> _Job:
             read_landmarks(options.landmarks, scale=options.scale),
             read_landmarks(options.control_landmarks, scale=options.control_scale),
         )
-    if options.symmetry is not None and mesh is None:
-        raise ValueError("symmetry is that of a template: give --control MESH to --symmetry.")
+    if mesh is None and (options.symmetry is not None or options.likeness is not None):
+        which = "symmetry" if options.symmetry is not None else "likeness"
+        raise ValueError(f"{which} is that of a template: give --control MESH to --{which}.")
     boundary = None
     if options.boundary == "scan":
         boundary = BoundaryCurve(boundary_of(js.read_mesh(scan, scale=options.scale, check=False)))
@@ -359,6 +360,12 @@ def _parser() -> argparse.ArgumentParser:
     add("--landmarks", metavar="FILE", help="named places on the scan, .json or .csv; the template's in the next")
     add("--control-landmarks", metavar="FILE", help="the same names on the template")
     add("--symmetry", type=float, metavar="MM", help="keep the fit as symmetric as the template, but for so much")
+    add(
+        "--likeness",
+        type=float,
+        metavar="SHARE",
+        help="of the template's own shape, expected again where data lack: 0.7",
+    )
     add("--boundary", metavar="FILE", help="points of the curve that the open surface ends at; `scan`: the scan's rim")
     add("--tolerance", type=float, metavar="MM", help="split the control mesh until the surface is this near the scan")
     add("--points", type=int, metavar="N", help="fit no more than so many, drawn at random; all of them are measured")

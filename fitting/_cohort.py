@@ -127,7 +127,8 @@ def fit_cohort(
 
     Raises:
         ScanError: a scan cannot be fitted, or has slices that are free to move; the text names it by its number.
-        ValueError: as in `fit`; or the numbers of scans and controls differ, or the priors ask for symmetry.
+        ValueError: as in `fit`; or the numbers of scans and controls differ, or the priors ask for symmetry or
+            likeness.
     """
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
     controls = [controls] * len(scans) if isinstance(controls, js.Control) else list(controls)
@@ -137,6 +138,11 @@ def fit_cohort(
         raise ValueError(
             "a cohort has no prior of symmetry: its steps do not solve for a mirror plane. Leave `Priors.symmetry` "
             "out, or call `fit` for each scan."
+        )
+    if priors.likeness > 0:
+        raise ValueError(
+            "a cohort has no prior of likeness to its control meshes. Leave `Priors.likeness` out, or call `fit` for "
+            "each scan."
         )
     for i, (control, scan) in enumerate(zip(controls, scans, strict=True)):
         try:

@@ -41,6 +41,7 @@ from ._residuals import (
     Rows,
     Start,
     bend_edges,
+    bends_of,
     control_edges,
     control_faces_of,
     prior_faces,
@@ -135,6 +136,8 @@ class Problem:
         self._patches = find_patches(surface, owner, sum(map(len, topology.control_faces.values())))
         self._faces = prior_faces(scheme, topology, anchors, owner, 0 if masks.h is None else masks.h.size)
         self._edges, self._bend_edges = control_edges(topology), bend_edges(topology)
+        alone = Start(scheme, topology, control, control.vertices, None, self._edges, self._bend_edges)
+        self._bends = np.asarray(bends_of(alone, scheme, control, surface), np.float64)
         self._around = neighbourhoods(topology)
         self._folds = Folds(topology)
         self._edge = float(edge_length(topology, control.vertices))
@@ -191,7 +194,7 @@ class Problem:
         data, gradient, border = self._of_distances(found, seen, shifts)
         rows, by_priors = jax.tree.map(lambda values: np.asarray(values, np.float64), (found.rows, found.by_rows))
         if not len(self._precision):
-            first = 1 / max(float(np.mean(np.square(rows.bend))) / _STIFFER, _TINY)
+            first = 1 / max(float(np.mean(np.square(self._bends))) / _STIFFER, _TINY)
             self._set_bend(np.full(len(elements.columns), first))
         weights, of_priors = np.concatenate(self.prior_precisions()), self._row_faces(start)
         gradient += times_transposed(elements, by_priors, weights * np.concatenate(rows[1:]), of_priors)
@@ -233,12 +236,19 @@ class Problem:
 
     def start(self, scheme: js.AbstractScheme, control: js.Control) -> Start:
         """The arguments of the residuals, for a sweep that starts here."""
-        template = moved_to(self._template, np.asarray(control.vertices, np.float64))
-        template = jnp.asarray(template, control.vertices.dtype)
+        moved = moved_to(self._template, np.asarray(control.vertices, np.float64))
+        template = jnp.asarray(moved, control.vertices.dtype)
+        expected = None
+        if self._priors.likeness > 0:
+            larger = np.linalg.norm(moved - moved.mean(axis=0)) / np.linalg.norm(
+                self._template - self._template.mean(axis=0)
+            )
+            expected = jnp.asarray(float(self._priors.likeness) * larger * self._bends, template.dtype)
         rim = None
         if self._curve is not None:
             rim = pair_with_boundary(self._curve, js.refine(scheme, self._topology, control))
-        return Start(scheme, self._topology, control, template, self._anchors, self._edges, self._bend_edges, rim)
+        tables = self._anchors, self._edges, self._bend_edges
+        return Start(scheme, self._topology, control, template, *tables, rim, expected)
 
     def _row_faces(self, start: Start) -> Int[np.ndarray, "m"]:
         """The control face of every row of the priors."""

@@ -288,19 +288,21 @@ def test_symmetry_and_boundary_reach_the_fit(files, monkeypatch, capsys):
     rim = np.array([(1.0, 2, 3), (4, 5, 6)])
     np.savetxt("rim.xyz", rim)
     js.write_mesh("open.ply", js.ControlMesh(*open_pyramid()))
-    for options in ("", "--symmetry 0.5", "--boundary rim.xyz --scale 10", "--boundary scan --scale 10"):
+    for options in ("", "--symmetry 0.5 --likeness 0.7", "--boundary rim.xyz --scale 10", "--boundary scan --scale 10"):
         run(fit, "open.ply", "--control", "control.obj", *options.split())
     assert np.isinf(seen[0][0].symmetry) and seen[0][1] is None
     assert float(seen[1][0].symmetry) == 0.5 and seen[1][1] is None
+    assert float(seen[1][0].likeness) == pytest.approx(0.7) and float(seen[0][0].likeness) == 0
     np.testing.assert_allclose(seen[2][1].points, 10 * rim)
     np.testing.assert_allclose(seen[3][1].points, 10 * np.asarray(open_pyramid()[0])[[0, 3, 4]])
     capsys.readouterr()
     assert run(fit, "scan.xyz", "--control", "control.obj", "--boundary", "scan") == 2
     assert run(fit, "scan.xyz", "--control", "control.obj", "--symmetry", "-1") == 2
     assert run(fit, "scan.xyz", "--symmetry", "1") == 2
+    assert run(fit, "scan.xyz", "--likeness", "1") == 2
     words = capsys.readouterr().err
     assert "scan.xyz" in words and "a standard deviation must be positive" in words
-    assert "give --control MESH to --symmetry" in words
+    assert "give --control MESH to --symmetry" in words and "give --control MESH to --likeness" in words
 
 
 def test_many_scans_get_a_folder_each_and_a_summary_though_one_fails(files, capsys):
