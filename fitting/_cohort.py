@@ -157,7 +157,7 @@ def fit_cohort(
     sound = {}
     for control in controls:  # mostly the same one for all
         if id(control) not in sound:
-            sound[id(control)] = sound_start(topology, control, free)
+            sound[id(control)] = sound_start(scheme, topology, control, free)
     controls = [sound[id(control)] for control in controls]
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
     if priors.bend is None and pilot is None:

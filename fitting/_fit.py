@@ -112,7 +112,7 @@ def fit(
 
     Raises:
         UserWarning: the start is so far off that the fit will hardly find its way; or faces of the control mesh lie
-            upside down on their neighbours, and the fit starts with them turned back.
+            upside down on their neighbours, which the fit turns back at its start, as far as it can.
         ScanError: the sizes of scan and control mesh differ as by a wrong unit, or there are too few points.
         ValueError: the topology has no levels, or does not fit the control; the control mesh has no symmetry, though
             the priors ask for it; the checkpoint is of another fit.
@@ -122,7 +122,7 @@ def fit(
     # Made here and not in the signature: arrays made while a module loads would settle JAX's device and precision.
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
     symmetry = _partners(symmetry, priors, topology, control)
-    control = sound_start(topology, control, free)
+    control = sound_start(scheme, topology, control, free)
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
     settings["landmark_deviation"] = landmark_deviation
     recipe = Recipe.of(scheme, topology, **settings)
@@ -266,9 +266,9 @@ def _anchors(
     return Anchors(points, at.face, corners, weights, deviations)
 
 
-def sound_start(topology: js.Topology, control: js.Control, free: Free) -> js.Control:
+def sound_start(scheme: js.AbstractScheme, topology: js.Topology, control: js.Control, free: Free) -> js.Control:
     """The control mesh without faces upside down, with unit normals that fold nothing."""
-    control = unfolded_start(topology, control, free)
+    control = unfolded_start(scheme, topology, control, free)
     return js.Control(control.vertices, given_normals(topology, control))
 
 

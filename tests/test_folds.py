@@ -93,11 +93,57 @@ def test_vertices_that_are_fixed_or_on_the_boundary_are_not_unfolded():
     np.testing.assert_array_equal(found[0], corner[0])
 
 
+def lens(rings: int = 4, spokes: int = 16) -> tuple[np.ndarray, list[tuple[int, int, int]]]:
+    """A closed thin disc with a sharp rim; its faces, those of the upper side first, begin in the middle."""
+    angle = 2 * np.pi * np.arange(spokes) / spokes
+    radius = np.repeat(np.arange(1.0, rings + 1), spokes)
+    x, y = radius * np.tile(np.cos(angle), rings), radius * np.tile(np.sin(angle), rings)
+    height = 0.04 * (rings**2 - radius**2)
+    upper = np.concatenate([[(0, 0, 0.04 * rings**2)], np.stack([x, y, height], axis=1)])
+    faces = [(0, 1 + i, 1 + (i + 1) % spokes) for i in range(spokes)]
+    for ring in range(rings - 1):
+        for i in range(spokes):
+            a, b = (1 + ring * spokes + j % spokes for j in (i, i + 1))
+            faces += [(a, a + spokes, b + spokes), (a, b + spokes, b)]
+    inner = 1 + (rings - 1) * spokes
+    down = np.arange(len(upper))
+    down[:inner] += len(upper)
+    vertices = np.concatenate([upper, upper[:inner] * (1, 1, -1)])
+    return vertices, faces + [tuple(down[list(face)][::-1]) for face in faces]
+
+
+def test_rim_of_a_thin_part_is_no_fold_and_stays_beside_one():
+    vertices, faces = lens()
+    mesh = js.ControlMesh(vertices, faces)
+    assert folds(mesh)._folded(mesh.vertices).sum() == 16 and not folds(mesh).upside_down(mesh.vertices).any()
+    a, b, c = faces[-1]  # at the rim, on the lower side
+    new = len(vertices)
+    middle = vertices[[a, b, c]].mean(axis=0)
+    with_one = np.concatenate([vertices, [middle + 1.6 * (vertices[[a, b]].mean(axis=0) - middle)]])
+    mesh = js.ControlMesh(
+        with_one, [face for face in faces if face != (a, b, c)] + [(a, b, new), (b, c, new), (c, a, new)]
+    )
+    assert folds(mesh).upside_down(with_one).sum() == 1
+    found = folds(mesh).unfolded(with_one, np.ones(len(with_one), bool))
+    moved = np.flatnonzero(np.any(found != with_one, axis=1))
+    assert not folds(mesh).upside_down(found).any() and len(moved) <= 6
+
+
+def test_warning_says_what_could_not_be_mended():
+    mesh = with_three_neighbours()
+    topology = js.build_topology(mesh, js.Interpolating(), 1)
+    control = js.ControlMesh(pushed_out(mesh), mesh.faces).control()
+    with pytest.warns(UserWarning, match=r"They stay, as their vertices are fixed"):
+        assert unfolded_start(js.Interpolating(), topology, control, fitting.Free(vertices=False)) is control
+    with pytest.raises(ValueError, match=r"`Free.vertices` has 5 rows for 43 control vertices"):
+        unfolded_start(js.Interpolating(), topology, control, fitting.Free(vertices=np.ones(5, bool)))
+
+
 def test_start_is_left_as_it_is_without_faces_upside_down(recwarn):
     mesh = with_three_neighbours()
     control = mesh.control()
     topology = js.build_topology(mesh, js.Interpolating(), 1)
-    assert unfolded_start(topology, control, fitting.Free()) is control and not recwarn.list
+    assert unfolded_start(js.Interpolating(), topology, control, fitting.Free()) is control and not recwarn.list
 
 
 @functools.cache
