@@ -27,7 +27,7 @@ from ._elements import flat, to_unknowns
 from ._fit import AT_REST, check, fit, sound_start, surface_moved
 from ._free import Free, Unknowns, apply_offset, edge_length, no_offset
 from ._look import Look, Surroundings, measure, surroundings
-from ._problem import FASTEST, HOLD, LEAST_LEFT, LET_GO, SOFTER, STEP, Found, Problem, moved_to
+from ._problem import FASTEST, HOLD, LEAST_LEFT, LET_GO, SOFTER, STEP, STIFFER, Found, Problem, moved_to
 from ._recipe import Recipe
 from ._residuals import Priors, Start, bend_asymmetry, bend_edges, control_edges, residuals
 from ._result import FitResult
@@ -308,7 +308,7 @@ def _sweep(common: _Common, subject: _Subject, state: _State) -> _State:
     at = search_closest(surface, subject.scan.points)
     seen = measure(surface, subject.scan, at, common.open_vertices, subject.around, edge, floor, common.loss)
 
-    stiff = 1 / jnp.mean(bend_asymmetry(topology, surface, common.bend_edges) ** 2)
+    stiff = STIFFER / jnp.mean(bend_asymmetry(topology, surface, common.bend_edges) ** 2)
     stiffest = jnp.where(k > 0, state.stiff, stiff)
     bend = jnp.maximum(common.bend, stiffest * SOFTER ** k.astype(edge.dtype))
     moved = surface_moved(js.RefinedSurface(*state.before, topology.faces), surface)
@@ -316,7 +316,8 @@ def _sweep(common: _Common, subject: _Subject, state: _State) -> _State:
     counted = jnp.maximum(jnp.sum(seen.weights > 0), 1).astype(edge.dtype)
     uncertainty = seen.scale * jnp.sqrt(control.vertices.shape[0] / counted)
     at_rest = common.tolerance * jnp.maximum(uncertainty, AT_REST * edge)
-    annealed = (k > 0) & (floor <= seen.scale) & jnp.all(bend <= common.bend)
+    at_noise = floor <= jnp.maximum(seen.noise, LEAST_NOISE * edge)
+    annealed = (k > 0) & at_noise & jnp.all(bend <= common.bend)
     converged = annealed & (jnp.maximum(moved, change) <= at_rest)
 
     step = lax.cond(

@@ -4,7 +4,7 @@ The strength of a Gaussian prior under which data are most probable obeys a fixe
 their variance, equal the number of bends that the data do not determine. Source: D. MacKay, Bayesian interpolation,
 1992, eq. (4.7); as an update for any number of strengths at once, S. Wood and M. Fasiolo, A generalized Fellner-Schall
 method for smoothing parameter optimization, 2017, eq. (4). Here every control face has a strength of its own, shared
-with its neighbourhood and, a little, with the whole surface: a skull is smoother than an ear.
+with its neighbourhood as the mean of logarithms and, a little, with the whole surface: a skull is smoother than an ear.
 """
 
 from collections.abc import Callable
@@ -68,4 +68,8 @@ def next_precision(
     changed = precision * np.clip(found / precision, 1 / _LARGEST_CHANGE, _LARGEST_CHANGE)
     # Means of the logarithms: means of the bends would be those of the one ear or rim in a neighbourhood, and leave
     # noise in all of it.
-    return np.exp(around @ np.log(changed))
+    has_bends = np.bincount(face, minlength=n) > 0  # edges that are not halved belong to one face of two
+    votes = around @ has_bends
+    return np.exp(
+        np.where(votes > 0, around @ (np.log(changed) * has_bends), np.log(changed)) / np.where(votes > 0, votes, 1)
+    )

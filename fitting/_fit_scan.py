@@ -96,8 +96,14 @@ def fit_scan(
             partners are found on the template as it is given.
 
     Raises:
+        ValueError: the priors ask for likeness, and there is no template to be like, or it is to be split: what is left
+            of its bends in a finer mesh is not known.
         ScanError, ValueError, ImportError, RuntimeError: as `align`, `control_mesh` and `fit` do.
     """
+    likeness = float(options["priors"].likeness) if options.get("priors") is not None else 0.0
+    if likeness > 0 and (mesh is None or tolerance_mm is not None):
+        what = "there is none: give one" if mesh is None else "it would be split for `tolerance_mm`: leave that out"
+        raise ValueError(f"`Priors.likeness` is to a template, and {what}, or leave the likeness out.")
     say = on_stage or (lambda words: None)
     first = scheme or js.Interpolating()
     of_tables = {name: options.pop(name) for name in ("mesh_normals", "limit") if name in options}

@@ -54,7 +54,7 @@ from ._symmetry import Mirror, Symmetry, Ties, mirror_at, ties
 # (an ear in a coarse mesh) points change sides from sweep to sweep, and exact steps would go to and fro for ever.
 STEP, HOLD, LET_GO, FASTEST = 0.25, 8.0, 0.7, 1e6
 _TRIES = 6  # of a step that turns faces upside down: their vertices are held faster each time
-_STIFFER = 10.0  # the bend prior's strength in the first sweep, over that of the template's own bends
+STIFFER = 10.0  # the bend prior's strength in the first sweep, over that of the template's own bends
 SOFTER = 0.3  # factor of the bend prior from sweep to sweep, down to its own strength
 _SETTLED = 0.3  # mean change of the logarithm of the bend prior's strength in a sweep
 LEAST_LEFT = 0.1  # of the degrees of freedom: what is less says that the scan has too few points
@@ -136,8 +136,7 @@ class Problem:
         self._patches = find_patches(surface, owner, sum(map(len, topology.control_faces.values())))
         self._faces = prior_faces(scheme, topology, anchors, owner, 0 if masks.h is None else masks.h.size)
         self._edges, self._bend_edges = control_edges(topology), bend_edges(topology)
-        alone = Start(scheme, topology, control, control.vertices, None, self._edges, self._bend_edges)
-        self._bends = np.asarray(bends_of(alone, scheme, control, surface), np.float64)
+        self._bends = np.asarray(bends_of(topology, self._bend_edges, scheme, control, surface), np.float64)
         self._around = neighbourhoods(topology)
         self._folds = Folds(topology)
         self._edge = float(edge_length(topology, control.vertices))
@@ -194,7 +193,7 @@ class Problem:
         data, gradient, border = self._of_distances(found, seen, shifts)
         rows, by_priors = jax.tree.map(lambda values: np.asarray(values, np.float64), (found.rows, found.by_rows))
         if not len(self._precision):
-            first = 1 / max(float(np.mean(np.square(self._bends))) / _STIFFER, _TINY)
+            first = 1 / max(float(np.mean(np.square(self._bends))) / STIFFER, _TINY)
             self._set_bend(np.full(len(elements.columns), first))
         weights, of_priors = np.concatenate(self.prior_precisions()), self._row_faces(start)
         gradient += times_transposed(elements, by_priors, weights * np.concatenate(rows[1:]), of_priors)

@@ -147,7 +147,7 @@ def surface_and_priors(offset: Unknowns, start: Start) -> tuple[Float[Array, "v 
     scheme, control = apply_offset(start.topology, start.scheme, start.control, offset)
     surface = js.refine(scheme, start.topology, control)
     dtype = surface.vertices.dtype
-    none, bends = jnp.zeros((0,), dtype), bends_of(start, scheme, control, surface)
+    none, bends = jnp.zeros((0,), dtype), bends_of(start.topology, start.bend_edges, scheme, control, surface)
     return surface.vertices, Rows(
         distance=none,
         bend=bends if start.expected is None else bends - start.expected,
@@ -197,13 +197,17 @@ def splits_in_four(topology: js.Topology) -> bool:
 
 
 def bends_of(
-    start: Start, scheme: js.AbstractScheme, control: js.Control, surface: js.RefinedSurface
+    topology: js.Topology,
+    edges: Int[Array | np.ndarray, "b 2"],
+    scheme: js.AbstractScheme,
+    control: js.Control,
+    surface: js.RefinedSurface,
 ) -> Float[Array, "b"]:
-    """Bend asymmetry of a control mesh that has the tables of `start`."""
+    """Bend asymmetry of a control mesh that was refined to this surface."""
     if not scheme.is_primal:  # the surface has no vertices of the control mesh
-        normals = js.estimate_normals(start.topology.control_fans, control.vertices)
-        surface = js.RefinedSurface(control.vertices, normals, start.topology.control_faces)
-    return bend_asymmetry(start.topology, surface, start.bend_edges)
+        normals = js.estimate_normals(topology.control_fans, control.vertices)
+        surface = js.RefinedSurface(control.vertices, normals, topology.control_faces)
+    return bend_asymmetry(topology, surface, edges)
 
 
 def _stretch(start: Start, control: js.Control) -> Float[Array, "s"]:

@@ -98,3 +98,11 @@ def test_cohort_says_that_it_has_none():
             [fitting.Scan(problem().points)],
             priors=Priors(likeness=0.5),
         )
+
+
+def test_likeness_needs_a_template_that_is_not_split():
+    scan, priors = fitting.Scan(problem().points), Priors(likeness=0.5)
+    with pytest.raises(ValueError, match=r"is to a template, and there is none: give one"):
+        fitting.fit_scan(scan, priors=priors)
+    with pytest.raises(ValueError, match=r"would be split for `tolerance_mm`: leave that out"):
+        fitting.fit_scan(scan, problem().mesh, priors=priors, tolerance_mm=0.1)
