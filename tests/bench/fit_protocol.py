@@ -122,12 +122,12 @@ class Judgement(NamedTuple):
     """Triangles of the surface that cross others."""
 
 
-def draw(truth: Trimesh, case: Case, seed: int) -> tuple[Problem, Float[np.ndarray, "3"]]:
+def draw(truth: Trimesh, case: Case, seed: int, data: Path = DATA) -> tuple[Problem, Float[np.ndarray, "3"]]:
     """The scan and template of a seed, and the centre of the hole. Cases of one seed share what they do not change."""
     hole_at, scan, start = np.random.default_rng(seed).spawn(3)
     centres = sample(truth, 1000, hole_at).points
     centre = centres[centres[:, 2] > truth.bounds[0, 2] + case.hole][0] if case.off_cap else centres[0]
-    template = functools.cache(lambda n: make_template(truth, case, n, start.bit_generator.seed_seq))
+    template = functools.cache(lambda n: make_template(truth, case, n, start.bit_generator.seed_seq, data))
     return Problem(*make_scan(truth, case, centre, scan), template, case.vertices), centre
 
 
@@ -146,11 +146,13 @@ def make_scan(
     return scan[order], order < len(points)
 
 
-def make_template(truth: Trimesh, case: Case, n_vertices: int, seed: np.random.SeedSequence) -> Trimesh:
+def make_template(
+    truth: Trimesh, case: Case, n_vertices: int, seed: np.random.SeedSequence, data: Path = DATA
+) -> Trimesh:
     """The smoothed head, warped, rotated, scaled, shifted, then remeshed; vertex normals from the dense mesh."""
     rng = np.random.default_rng(seed)
     is_cortex = case.truth == CORTEX
-    dense = split_once(DATA / CORTEX_MESH) if is_cortex else truth.copy()
+    dense = split_once(data / CORTEX_MESH) if is_cortex else truth.copy()
     trimesh.smoothing.filter_taubin(dense, iterations=case.smoothing)
     x = dense.vertices - dense.centroid
     warp = smooth_field(x, rng)
@@ -357,7 +359,7 @@ def run(data: Path, cases: Sequence[str], methods: Sequence[str], seeds: Sequenc
     rows = []
     for name in cases:
         truth = true_surface(data / CASES[name].truth)
-        problems = {seed: draw(truth, CASES[name], seed) for seed in seeds}
+        problems = {seed: draw(truth, CASES[name], seed, data) for seed in seeds}
         for method in methods:
             for seed, (problem, centre) in problems.items():
                 row = {"case": name, "method": method, "seed": seed}
