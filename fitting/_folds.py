@@ -110,19 +110,17 @@ def unfolded_start(scheme: js.AbstractScheme, topology: js.Topology, control: js
     masks = free.of(scheme, len(given))
     may_move = np.zeros(len(given), bool) if masks.vertices is None else np.asarray(masks.vertices)[:, 0]
     mended = folds.unfolded(given, may_move)
-    stay = np.sum(turned & folds.upside_down(mended))
-    done = {
-        0: "The fit starts with their vertices moved between their neighbours.",
-        np.sum(
-            turned
-        ): "They stay, as their vertices are fixed, on a boundary, or in a knot: look at the surface there.",
-    }.get(stay, f"The fit starts with their vertices moved between their neighbours, but {stay} of them stay.")
+    n_stay = np.sum(turned & folds.upside_down(mended))
+    unmended = n_stay == np.sum(turned)
+    if unmended:
+        done = "They stay, as their vertices are fixed, on a boundary, or in a knot: look at the surface there."
+    else:
+        but = f", but {n_stay} of them stay" if n_stay else ""
+        done = f"The fit starts with their vertices moved between their neighbours{but}."
     warnings.warn(
         "faces of the control mesh that lie upside down on those beside them where the fit starts: "
         f"{name_rows(np.flatnonzero(turned))} ({np.sum(turned)} of {len(turned)}, triangles counted before quads). "
         f"{done} Mend them in the control mesh, or make it again.",
         stacklevel=4,
     )
-    return (
-        control if stay == np.sum(turned) else js.Control(jnp.asarray(mended, control.vertices.dtype), control.normals)
-    )
+    return control if unmended else js.Control(jnp.asarray(mended, control.vertices.dtype), control.normals)
