@@ -364,7 +364,7 @@ def _parser() -> argparse.ArgumentParser:
         "--likeness",
         type=float,
         metavar="SHARE",
-        help="of the template's own shape, expected again where data lack: 0.7",
+        help="of the template's own shape, expected of the fit; default: found. 0 where it was made from this scan",
     )
     add("--boundary", metavar="FILE", help="points of the curve that the open surface ends at; `scan`: the scan's rim")
     add("--tolerance", type=float, metavar="MM", help="split the control mesh until the surface is this near the scan")

@@ -27,9 +27,9 @@ from ._elements import flat, to_unknowns
 from ._fit import AT_REST, check, fit, sound_start, surface_moved
 from ._free import Free, Unknowns, apply_offset, edge_length, no_offset
 from ._look import Look, Surroundings, measure, surroundings
-from ._problem import FASTEST, HOLD, LEAST_LEFT, LET_GO, SOFTER, STEP, STIFFER, Found, Problem, moved_to
+from ._problem import FASTEST, HOLD, LEAST_LEFT, LET_GO, SOFTER, STEP, STIFFER, Found, Problem, larger, moved_to
 from ._recipe import Recipe
-from ._residuals import Priors, Start, bend_asymmetry, bend_edges, control_edges, residuals
+from ._residuals import Priors, Start, bend_asymmetry, bend_edges, bends_of, control_edges, residuals
 from ._result import FitResult
 from ._robust import AbstractLoss, geman_mcclure
 from ._scan import Scan, ScanError
@@ -52,6 +52,7 @@ class _Common(NamedTuple):
     is_free: Float[Array | np.ndarray, "n"]
     bend: Float[Array, "b"]
     """1 / variance of every bend."""
+    likeness: Float[Array, ""]
     determined: Float[Array, ""]
     """Degrees of freedom that a scan's points determine, about."""
     edges: Int[Array | np.ndarray, "e 2"]
@@ -84,6 +85,8 @@ class _State(NamedTuple):
     """Scale of the distances at the start."""
     stiff: Float[Array, ""]
     """1 / variance of the bends at the start."""
+    expected: Float[Array, "b"]
+    """Bends, as the start has them."""
     hold: Float[Array, "n"]
     step: Float[Array, "n"]
     rms: Float[Array, "sweeps"]
@@ -116,7 +119,8 @@ def fit_cohort(
         controls: where the fits start: one control for all, or one a scan, aligned with it (see `align`).
         scans: in mm. They may differ in length; all have normals, or none.
         free, loss, max_sweeps, tolerance: as in `fit`.
-        priors: as in `fit`; with `bend=None`, the default, the smoothness is that of the pilot, place by place.
+        priors: as in `fit`; with `bend=None`, the default, the smoothness is that of the pilot, place by place; and
+            with `likeness=None` so is how much of each control mesh's own shape is expected of it.
         pilot: an ordinary fit of the same control mesh; default, where it is needed: that of the first scan.
         at_once: how many subjects share each operation, as the memory allows: on an accelerator many; on a CPU one at
             a time is as fast, and stops when it has converged.
@@ -127,8 +131,7 @@ def fit_cohort(
 
     Raises:
         ScanError: a scan cannot be fitted, or has slices that are free to move; the text names it by its number.
-        ValueError: as in `fit`; or the numbers of scans and controls differ, or the priors ask for symmetry or
-            likeness.
+        ValueError: as in `fit`; or the numbers of scans and controls differ, or the priors ask for symmetry.
     """
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
     controls = [controls] * len(scans) if isinstance(controls, js.Control) else list(controls)
@@ -138,11 +141,6 @@ def fit_cohort(
         raise ValueError(
             "a cohort has no prior of symmetry: its steps do not solve for a mirror plane. Leave `Priors.symmetry` "
             "out, or call `fit` for each scan."
-        )
-    if priors.likeness > 0:
-        raise ValueError(
-            "a cohort has no prior of likeness to its control meshes. Leave `Priors.likeness` out, or call `fit` for "
-            "each scan."
         )
     for i, (control, scan) in enumerate(zip(controls, scans, strict=True)):
         try:
@@ -174,6 +172,7 @@ def fit_cohort(
         zero=no_offset(free, scheme, controls[0]),
         is_free=jnp.asarray(flat(masks), dtype),
         bend=jnp.asarray(problem.prior_precisions().bend, dtype),
+        likeness=jnp.asarray(problem.likeness, dtype),
         determined=jnp.asarray(problem.determined, dtype),
         edges=control_edges(topology),
         bend_edges=bend_edges(topology),
@@ -210,7 +209,7 @@ def fit_cohort(
 
 
 def _strength(problem: Problem, priors: Priors, pilot: FitResult | None) -> Found:
-    """Of the bend prior: as given, or as the pilot found it."""
+    """Of the bend prior, and what it expects: as given, or as the pilot found it."""
     found = problem.found()
     if priors.bend is not None:
         n_faces = sum(len(faces) for faces in problem.topology.control_faces.values())
@@ -219,7 +218,7 @@ def _strength(problem: Problem, priors: Priors, pilot: FitResult | None) -> Foun
         return found
     told = pilot._problem.found()
     if priors.bend is None:
-        found = found._replace(bend_precision=told.bend_precision)
+        found = found._replace(bend_precision=told.bend_precision, likeness=told.likeness)
     return found._replace(determined=told.determined)
 
 
@@ -274,17 +273,19 @@ def _with(scheme: js.AbstractScheme, h: Float[Array, "..."] | None) -> js.Abstra
 def _first(common: _Common, subject: _Subject, max_sweeps: int) -> _State:
     x = subject.control.vertices
     none, nothing = jnp.zeros((), x.dtype), jnp.zeros_like(common.is_free)
-    shapes = jax.eval_shape(_refined, common, common.scheme.h, subject.control)
+    surface = _refined(common, common.scheme.h, subject.control)
+    expected = bends_of(common.topology, common.bend_edges, common.scheme, subject.control, surface)
     unknown = jnp.full(max_sweeps + 1, jnp.nan, x.dtype)
     return _State(
         sweep=jnp.int32(0),
         h=common.scheme.h,
         control=subject.control,
-        before=(jnp.zeros_like(shapes.vertices), jnp.zeros_like(shapes.normals)),
+        before=(jnp.zeros_like(surface.vertices), jnp.zeros_like(surface.normals)),
         weights=jnp.zeros_like(subject.scan.points[:, 0]),
         noise=none,
         widest=none,
         stiff=none,
+        expected=common.likeness * expected,
         hold=_loosest(common, x),
         step=nothing,
         rms=unknown,
@@ -337,6 +338,7 @@ def _sweep(common: _Common, subject: _Subject, state: _State) -> _State:
         noise=seen.noise,
         widest=jnp.where(k > 0, state.widest, seen.scale),
         stiff=stiffest,
+        expected=state.expected,
         hold=_held(common, state, step),
         step=step,
         rms=state.rms.at[k].set(seen.rms),
@@ -352,7 +354,9 @@ def _solved(
     """A Gauss-Newton step of optimistix from here, pairs and weights held."""
     template = moved_to(subject.control.vertices, state.control.vertices, jnp)
     scheme = _with(common.scheme, state.h)
-    start = Start(scheme, common.topology, state.control, template, None, common.edges, common.bend_edges)
+    tables = None, common.edges, common.bend_edges
+    expected = state.expected * larger(subject.control.vertices, template, jnp)
+    start = Start(scheme, common.topology, state.control, template, *tables, None, expected)
     left = jnp.maximum(1 - common.determined / jnp.maximum(jnp.sum(seen.weights), 1.0), LEAST_LEFT)
     deviations = jnp.sqrt(seen.precisions * left * subject.part), jnp.sqrt(bend), jnp.sqrt(state.hold)
 

@@ -64,7 +64,8 @@ class Cohort:
         edge = float(edge_length(topology, control.vertices))
         seen = View(scan, surface, edge, recipe.loss).seen_from(surface)
         problem = Problem(recipe.scheme, topology, start, recipe.free, recipe.priors)
-        problem.tell(self._problem.found()._replace(template=np.asarray(start.vertices, np.float64)))
+        own = problem.found()  # the template and its bends; the strengths are those of all
+        problem.tell(self._problem.found()._replace(template=own.template, expected=own.expected))
         counted, ends = slice(None, int(self.sweeps[i]) + 1), optx.RESULTS
         stopped = ends.nonlinear_max_steps_reached if self._finite[i] else ends.nonfinite
         return FitResult(

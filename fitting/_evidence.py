@@ -1,10 +1,15 @@
-"""How smooth the surface is, found from the scan: the bend prior that makes the scan most probable, place by place.
+"""How smooth the surface is, and how like its template, found from the scan: the bend prior that makes the scan most
+probable, place by place.
 
 The strength of a Gaussian prior under which data are most probable obeys a fixed point: the bends that are left, over
 their variance, equal the number of bends that the data do not determine. Source: D. MacKay, Bayesian interpolation,
 1992, eq. (4.7); as an update for any number of strengths at once, S. Wood and M. Fasiolo, A generalized Fellner-Schall
 method for smoothing parameter optimization, 2017, eq. (4). Here every control face has a strength of its own, shared
 with its neighbourhood as the mean of logarithms and, a little, with the whole surface: a skull is smoother than an ear.
+
+The prior's means are the template's bends times one number, the likeness. Under given strengths that is most probable
+which is found together with the surface, as one more unknown. Source: C. Henderson, Best linear unbiased estimation and
+prediction under a selection model, 1975, eq. (8).
 """
 
 from collections.abc import Callable
@@ -21,6 +26,7 @@ _PROBES = 24  # random vectors of a trace; a face and its neighbourhood average 
 _SHARE_OF_ALL = 0.05  # how much the whole surface counts beside a face
 _TINY = np.finfo(float).tiny
 _LARGEST_CHANGE = 5.0  # of a strength in one sweep: what it depends on is known for the present one only
+_PART_OF_WAY = 0.5  # of the likeness: it and the strengths are found in turns, whole steps overshoot
 
 
 def neighbourhoods(topology: js.Topology) -> sp.csr_array:
@@ -73,3 +79,30 @@ def next_precision(
     return np.exp(
         np.where(votes > 0, around @ (np.log(changed) * has_bends), np.log(changed)) / np.where(votes > 0, votes, 1)
     )
+
+
+def next_likeness(
+    likeness: float,
+    expected: Float[np.ndarray, "b"],
+    precision: Float[np.ndarray, "b"],
+    bends: Float[np.ndarray, "b"],
+    by: sp.csr_array,
+    solve_posterior: Solve,
+) -> float:
+    """A step towards the likeness, from 0 to 1, that makes the scan most probable; none where that is as near as the
+    scan can tell.
+
+    Args:
+        expected: the template's bends in mm.
+        precision: 1 / variance of each bend.
+        bends: departures from what is expected now, in mm.
+        by: their derivatives by the unknowns.
+        solve_posterior: with the normal matrix of the priors and the scan.
+    """
+    side = by.T @ (precision * expected)
+    # Beforehand it is 0, give or take 1: a template without bends, or without a scan over them, is expected nowhere.
+    slope = float(expected @ (precision * bends)) - likeness
+    curvature = float(expected @ (precision * expected) - side @ solve_posterior(side[:, None])[:, 0]) + 1
+    if slope**2 < curvature:  # less than its own standard deviation
+        return likeness
+    return float(np.clip(likeness + _PART_OF_WAY * slope / curvature, 0.0, 1.0))

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 import jaxsubdiv as js
 from jaxsubdiv._linalg import dot, unit
@@ -68,6 +68,7 @@ def fit(
     landmark_deviation: float = 1.0,
     symmetry: Symmetry | None = None,
     boundary: BoundaryCurve | None = None,
+    alike: Bool[np.ndarray, "f"] | None = None,
     max_sweeps: int = 60,
     tolerance: float = 0.1,
     throw: bool = True,
@@ -100,6 +101,8 @@ def fit(
             on the control mesh where the fit starts.
         boundary: a curve that the open surface ends at: its boundary follows from the points of the curve, and scan
             points beyond it do not count.
+        alike: control faces whose shape where the fit starts says what to expect, see `Priors.likeness`; triangles
+            first. Default: all.
         max_sweeps: how many sweeps at most.
         tolerance: converged once a sweep, annealed, moves nine tenths of the surface, and the RMS distance, by less
             than this part of the surface's uncertainty, which is about noise / sqrt(points a control vertex); or of a
@@ -127,7 +130,7 @@ def fit(
     settings["landmark_deviation"] = landmark_deviation
     recipe = Recipe.of(scheme, topology, **settings)
     given = {"scheme": scheme, "topology": topology, "control": control, "scan": scan, "landmarks": landmarks}
-    given |= {"symmetry": symmetry, "boundary": boundary}
+    given |= {"symmetry": symmetry, "boundary": boundary, "alike": alike}
     kept = None if checkpoint is None else Checkpoint(Path(checkpoint) / CHECKPOINT, given | settings)
     before = None if kept is None else kept.read()
     start = control
@@ -140,7 +143,7 @@ def fit(
     _warn_if_far(float(np.median(np.abs(seen.distances))), control)
     rms, robust_rms, result = [float(seen.rms)], [float(seen.robust_rms)], optx.RESULTS.nonlinear_max_steps_reached
     anchors = None if landmarks is None else _anchors(landmarks, landmark_deviation, topology, control, surface)
-    problem = Problem(scheme, topology, control, free, priors, anchors, symmetry, curve)
+    problem = Problem(scheme, topology, control, free, priors, anchors, symmetry, curve, alike)
     waiting, shifts = find_shifts(scan) if free.shifts else None, None
     if before is not None:
         scheme, control, rms, robust_rms = _recalled(before, problem, scheme, control)
@@ -214,7 +217,8 @@ def _recalled(
 ) -> tuple[js.AbstractScheme, js.Control, list[float], list[float]]:
     """Scheme, control and RMS distances of a fit that was stopped; its problem takes up what it knew."""
     memory = Memory._make(before[name] for name in Memory._fields)
-    memory = memory._replace(determined=float(memory.determined), annealed=bool(memory.annealed))
+    numbers = {"likeness": float(memory.likeness), "determined": float(memory.determined)}
+    memory = memory._replace(**numbers, annealed=bool(memory.annealed))
     problem.recall(memory, scheme, control)
     if scheme.h is not None:
         scheme = eqx.tree_at(lambda s: s.h, scheme, jnp.asarray(before["h"]))

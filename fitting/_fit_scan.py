@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
 import jaxsubdiv as js
@@ -21,6 +21,7 @@ from ._correspondence import nearest_rows
 from ._fit import check, fit
 from ._landmarks import Landmarks
 from ._recipe import Recipe
+from ._residuals import Priors, splits_in_four
 from ._result import FitResult
 from ._scan import Scan
 from ._symmetry import Symmetry, find_symmetry
@@ -54,6 +55,8 @@ class _Start(NamedTuple):
     scheme: js.AbstractScheme
     alignment: Alignment | None
     splits: int
+    bare: Bool[np.ndarray, "f"] | None = None
+    """Control faces without scan points, of a mesh that was split; None before."""
 
 
 def fit_scan(
@@ -96,14 +99,14 @@ def fit_scan(
             partners are found on the template as it is given.
 
     Raises:
-        ValueError: the priors ask for likeness, and there is no template to be like, or it is to be split: what is left
-            of its bends in a finer mesh is not known.
+        ValueError: the priors ask for likeness, and there is no template to be like.
         ScanError, ValueError, ImportError, RuntimeError: as `align`, `control_mesh` and `fit` do.
     """
-    likeness = float(options["priors"].likeness) if options.get("priors") is not None else 0.0
-    if likeness > 0 and (mesh is None or tolerance_mm is not None):
-        what = "there is none: give one" if mesh is None else "it would be split for `tolerance_mm`: leave that out"
-        raise ValueError(f"`Priors.likeness` is to a template, and {what}, or leave the likeness out.")
+    priors = options.pop("priors", None) or Priors()
+    if mesh is None and priors.likeness is not None and priors.likeness > 0:
+        raise ValueError("`Priors.likeness` is to a template, and there is none: give one, or leave the likeness out.")
+    # A mesh made from the scan would be found to be very like it, with all of its noise.
+    options["priors"] = dataclasses.replace(priors, likeness=0.0) if mesh is None else priors
     say = on_stage or (lambda words: None)
     first = scheme or js.Interpolating()
     of_tables = {name: options.pop(name) for name in ("mesh_normals", "limit") if name in options}
@@ -130,7 +133,7 @@ def fit_scan(
         start = _Start(alignment.mesh, first, alignment, 0)
     else:
         start = _Start(mesh, first, None, 0)
-    own_partners, priors = options.pop("symmetry", None), options.get("priors")
+    own_partners = options.pop("symmetry", None)
     while True:
         say(f"fits {len(start.mesh.vertices):,} control vertices")
         # Tables come from the faces alone; normals that would fold the surface are replaced in the fit.
@@ -145,24 +148,33 @@ def fit_scan(
         # The landmarks' places were those of the template.
         of_first = _landmarks_there(landmarks, mesh, start) if start.splits == 0 else None
         partners = own_partners if start.splits == 0 else None
-        if partners is None and mesh is not None and priors is not None and np.isfinite(priors.symmetry):
+        if partners is None and mesh is not None and np.isfinite(priors.symmetry):
             partners = _partners(mesh, first, start.splits)
         here = {"landmarks": of_first, "symmetry": partners, "checkpoint": checkpoint}
-        result = fit(start.scheme, topology, control, scan, **here, **options)
+        if start.bare is not None:
+            # Holes stay as they were filled; elsewhere the noise of the scan, which is in the fit now, is not expected.
+            here |= {"alike": start.bare, "priors": dataclasses.replace(priors, likeness=1.0)}
+        result = fit(start.scheme, topology, control, scan, **(options | here))
         outcome = _outcome(result, start.mesh, tolerance_mm, most_faces)
         if tolerance_mm is None or outcome is not None:
             break
-        start = _Start(
-            _split(result.scheme, start.mesh, result.control), result.scheme, start.alignment, start.splits + 1
-        )
+        finer = _split(result.scheme, start.mesh, result.control)
+        bare = np.repeat(~_has_points(result), 4) if splits_in_four(topology) else np.zeros(finer.n_faces, bool)
+        start = _Start(finer, result.scheme, start.alignment, start.splits + 1, bare)
     if kept is not None:
         kept.remove()
     if scan is not whole:
         say(f"measures all {whole.n_points:,} points")
         result = result.on(whole)
     assert result.recipe is not None
-    result.recipe = dataclasses.replace(result.recipe, scheme=first, **settings)
+    result.recipe = dataclasses.replace(result.recipe, scheme=first, priors=priors, **settings)
     return ScanFit(result, start.mesh, start.alignment, start.splits, outcome)
+
+
+def _has_points(result: FitResult) -> Bool[np.ndarray, "f"]:
+    """Control faces that the scan has points on."""
+    owner, counted = result._problem.owner, result.inliers & (result.weights > 0)
+    return np.bincount(owner[np.asarray(result.at.face)[counted]], minlength=owner.max() + 1) > 0
 
 
 def _partners(template: js.ControlMesh, scheme: js.AbstractScheme, splits: int) -> Symmetry:
@@ -182,7 +194,7 @@ def _arrays(start: _Start) -> dict[str, Any]:
     """A start as a checkpoint keeps it; the mesh of the alignment follows from the rest."""
     mesh, alignment = start.mesh, start.alignment
     arrays = {"vertices": mesh.vertices, "triangles": mesh.faces[3], "quads": mesh.faces[4], "normals": mesh.normals}
-    arrays |= {"h": start.scheme.h, "splits": start.splits}
+    arrays |= {"h": start.scheme.h, "splits": start.splits, "bare": start.bare}
     return arrays if alignment is None else arrays | alignment._replace(mesh=None)._asdict()
 
 
@@ -196,7 +208,7 @@ def _recalled(arrays: dict[str, np.ndarray], scheme: js.AbstractScheme, template
     if template is not None and "transform" in arrays:
         numbers = float(arrays["rms"]), float(arrays["share"]), tuple(map(str, arrays["doubts"]))
         alignment = Alignment(arrays["transform"], put(template, arrays["transform"]), *numbers)
-    return _Start(mesh, scheme, alignment, int(arrays["splits"]))
+    return _Start(mesh, scheme, alignment, int(arrays["splits"]), arrays.get("bare"))
 
 
 def misfit(result: FitResult) -> float:
@@ -231,8 +243,8 @@ def _split(scheme: js.AbstractScheme, mesh: js.ControlMesh, control: js.Control)
     """A control mesh of these faces, each cut in four by the scheme's rule: the same surface, with more to move."""
     if scheme.h is not None and scheme.h.ndim:  # one h a level: what is left of it serves the split mesh
         scheme = dataclasses.replace(scheme, h=scheme.h[:1])
-    fitted = js.ControlMesh(control.vertices, mesh.faces, control.normals, check=False)
-    finer = js.refine(scheme, js.build_topology(fitted, scheme, 1), control)
+    bare = js.ControlMesh(control.vertices, mesh.faces, check=False)
+    finer = js.refine(scheme, js.build_topology(bare, scheme, 1), control)
     return js.ControlMesh(finer.vertices, finer.faces, finer.normals if scheme.uses_normals else None)
 
 

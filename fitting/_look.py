@@ -119,7 +119,7 @@ def measure(
     distance, spread = norm(away)[:, 0], scan.relative_deviations()
     given = jnp.where(around.scattered, 0.0, scan.weights_or_ones())
     corners, inside = corner_weights(surface, at)
-    at_boundary = jnp.sum(jnp.where(open_vertices[corners], inside, 0.0), axis=1) > 1 - _ON_BOUNDARY
+    at_boundary = on_boundary(open_vertices, corners, inside)
     if scan.normals is not None:
         cosine = dot(unit(scan.normals), normals)[:, 0]
         # Files have normals of either side: the side that most points are on is outside.
@@ -140,7 +140,7 @@ def measure(
     across = jnp.abs(dot(normals, away))[:, 0]
     goes_on = around.crowded & (distance < edge) & (across < 3 * scale * spread + _STEEPEST * distance)
     if held is not None:
-        goes_on &= jnp.sum(jnp.where(held[corners], inside, 0.0), axis=1) < 1 - _ON_BOUNDARY
+        goes_on &= ~on_boundary(held, corners, inside)
     weights = jnp.where(at_boundary & ~goes_on, 0.0, weights)
     # The derivative of a distance is along it: across the face, or from the edge or boundary that is closest.
     directions = jnp.where(distance[:, None] > edge * _ON_SURFACE, unit(away), normals)
@@ -155,6 +155,13 @@ def measure(
         rms=_mean_root(distance, scan.weights_or_ones()),
         robust_rms=_mean_root(distance, weights),
     )
+
+
+def on_boundary(
+    boundary: Bool[Array | np.ndarray, "v"], corners: Int[Array, "p 4"], corner_weights: Float[Array, "p 4"]
+) -> Bool[Array, "p"]:
+    """Which surface points lie on the boundary, of whose vertices `boundary` is true."""
+    return jnp.sum(jnp.where(jnp.asarray(boundary)[corners], corner_weights, 0.0), axis=1) > 1 - _ON_BOUNDARY
 
 
 def _mean_root(distance: Float[Array, "p"], weights: Float[Array, "p"]) -> Float[Array, ""]:

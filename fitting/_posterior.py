@@ -13,8 +13,11 @@ from jaxtyping import Float, Int
 
 import jaxsubdiv as js
 
-from ._look import Look
+from ._correspondence import boundary_vertices
+from ._look import Look, on_boundary
+from ._misfit import misfit_variances
 from ._problem import Problem, factorise
+from ._residuals import splits_in_four
 from ._shifts import Shifts
 
 _DENSE = 4000  # unknowns whose covariance is kept whole, in 130 MB
@@ -23,12 +26,14 @@ _ROWS_AT_ONCE = 1024
 
 
 class Uncertainty(NamedTuple):
-    """How well a fit determines its surface: posterior standard deviations in mm, across the surface."""
+    """How well a fit determines its surface: standard deviations in mm, across the surface."""
 
     control: Float[np.ndarray, "v"]
-    """Of every control vertex."""
+    """Of every control vertex, posterior to scan and priors."""
     surface: Float[np.ndarray, "w"]
-    """Of every vertex of the refined surface."""
+    """Of every vertex of the refined surface from the anatomy: posterior, with the misfit."""
+    misfit: Float[np.ndarray, "w"]
+    """The part of it that the control mesh cannot follow, as residuals that points have in common show it."""
 
 
 class Posterior:
@@ -48,13 +53,31 @@ class Posterior:
         self.n_free = int(problem.is_free.sum())
 
     def uncertainty(self) -> Uncertainty:
-        """Exact for up to a few thousand unknowns; beyond, from random draws, to about 5 %."""
+        """The posterior part is exact for up to a few thousand unknowns; beyond, from random draws, to about 5 %."""
         problem = self.problem
         face, by_surface = problem.across(self.scheme, self.control)
         columns, by_control = problem.across_control(self.control)
         variance = self._variances()
         surface, control = variance(problem.elements.columns[face], by_surface), variance(columns, by_control)
-        return Uncertainty(np.sqrt(np.maximum(control, 0)), np.sqrt(np.maximum(surface, 0)))
+        surface, control = np.maximum(surface, 0), np.maximum(control, 0)
+        misfit = self._misfit_variances(surface)
+        return Uncertainty(np.sqrt(control), np.sqrt(surface + misfit), np.sqrt(misfit))
+
+    def _misfit_variances(self, variances: Float[np.ndarray, "w"]) -> Float[np.ndarray, "w"]:
+        """Of the vertices of the surface, means of the control faces that they lie on."""
+        seen, corners, owner = self.seen, self.problem.corners, self.problem.owner
+        surface = js.refine(self.scheme, self.problem.topology, self.control)
+        pairs, open_vertices = seen.pairs, boundary_vertices(surface)
+        # Where a surface ends, distances run along it.
+        counted = ~np.asarray(on_boundary(open_vertices, pairs.corners, pairs.corner_weights))
+        at_points = np.sum(np.asarray(pairs.corner_weights, np.float64) * variances[np.asarray(pairs.corners)], axis=1)
+        weights = np.asarray(seen.precisions, np.float64) * counted
+        distances, face = np.asarray(seen.distances, np.float64), np.asarray(seen.at.face)
+        finer = range(len(self.problem.topology.levels) - 1, -1, -1) if splits_in_four(self.problem.topology) else []
+        patches = [owner[face]] + [face // 4**level for level in finer]
+        of_faces = misfit_variances(distances, weights, at_points, patches, self.problem.around)
+        counts = np.bincount(corners.ravel(), minlength=len(variances))
+        return np.bincount(corners.ravel(), np.repeat(of_faces[owner], 4), len(variances)) / np.maximum(counts, 1)
 
     def _variances(self) -> Callable[[Int[np.ndarray, "m d"], Float[np.ndarray, "m d"]], Float[np.ndarray, "m"]]:
         """Variances of sums of unknowns, given by their columns and factors."""

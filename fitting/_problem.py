@@ -30,7 +30,7 @@ from ._elements import (
     times_transposed,
     to_unknowns,
 )
-from ._evidence import Solve, neighbourhoods, next_precision
+from ._evidence import Solve, neighbourhoods, next_likeness, next_precision
 from ._folds import Folds
 from ._free import Free, Unknowns, edge_length, no_offset
 from ._look import Look
@@ -57,6 +57,7 @@ _TRIES = 6  # of a step that turns faces upside down: their vertices are held fa
 STIFFER = 10.0  # the bend prior's strength in the first sweep, over that of the template's own bends
 SOFTER = 0.3  # factor of the bend prior from sweep to sweep, down to its own strength
 _SETTLED = 0.3  # mean change of the logarithm of the bend prior's strength in a sweep
+_SETTLED_LIKENESS = 0.1  # its change
 LEAST_LEFT = 0.1  # of the degrees of freedom: what is less says that the scan has too few points
 _PROBES = 16  # random vectors of a trace
 _MOST_RINGS = 3
@@ -93,6 +94,9 @@ class Found(NamedTuple):
     """Control vertices where the fit started, in mm."""
     bend_precision: Float[np.ndarray, "f"]
     """1 / variance of the bends, a control face; empty before the first sweep."""
+    expected: Float[np.ndarray, "b"]
+    """Bend asymmetry of likeness 1 in mm, at the size of the start."""
+    likeness: float
     determined: float
     annealed: bool
     anchors: Anchors | None
@@ -104,6 +108,7 @@ class Memory(NamedTuple):
     """What a problem knows after a sweep, and needs for the next."""
 
     bend_precision: Float[np.ndarray, "f"]
+    likeness: float
     determined: float
     annealed: bool
     hold: Float[np.ndarray, "n"]
@@ -123,6 +128,7 @@ class Problem:
         anchors: Anchors | None = None,
         symmetry: Symmetry | None = None,
         curve: BoundaryCurve | None = None,
+        alike: Bool[np.ndarray, "f"] | None = None,
     ):
         self._topology, self.free, self._priors, self._anchors = topology, free, priors, anchors
         self._symmetry, self._curve = symmetry, curve
@@ -137,11 +143,13 @@ class Problem:
         self._faces = prior_faces(scheme, topology, anchors, owner, 0 if masks.h is None else masks.h.size)
         self._edges, self._bend_edges = control_edges(topology), bend_edges(topology)
         self._bends = np.asarray(bends_of(topology, self._bend_edges, scheme, control, surface), np.float64)
-        self._around = neighbourhoods(topology)
+        self._expected = self._bends if alike is None else np.where(alike[self._faces.bend], self._bends, 0.0)
+        self.around = neighbourhoods(topology)
         self._folds = Folds(topology)
         self._edge = float(edge_length(topology, control.vertices))
         self._elements: Elements | None = None
         self._precision: Float[np.ndarray, "f"] = np.zeros(0)  # of the bends, a control face; found in the first sweep
+        self.likeness = 0.0 if priors.likeness is None else float(priors.likeness)
         self._hold = np.full(self.is_free.shape, (STEP * self._edge) ** -2)
         self.loose = self._hold.copy()
         self._last_step = np.zeros(self.is_free.shape)
@@ -173,7 +181,7 @@ class Problem:
         self._hold_what_turns_back(step)
         self._count_determined(found, loose)
         if self._priors.bend is None:
-            self._find_bend(found, step, loose)
+            self._find_bend(found, control, step, loose)
         else:
             self._set_bend(self._precision * SOFTER)
         return offset, shifts
@@ -237,17 +245,20 @@ class Problem:
         """The arguments of the residuals, for a sweep that starts here."""
         moved = moved_to(self._template, np.asarray(control.vertices, np.float64))
         template = jnp.asarray(moved, control.vertices.dtype)
-        expected = None
-        if self._priors.likeness > 0:
-            larger = np.linalg.norm(moved - moved.mean(axis=0)) / np.linalg.norm(
-                self._template - self._template.mean(axis=0)
-            )
-            expected = jnp.asarray(float(self._priors.likeness) * larger * self._bends, template.dtype)
+        expected = jnp.asarray(self.likeness * self._expected_at(moved), template.dtype)
         rim = None
         if self._curve is not None:
             rim = pair_with_boundary(self._curve, js.refine(scheme, self._topology, control))
         tables = self._anchors, self._edges, self._bend_edges
         return Start(scheme, self._topology, control, template, *tables, rim, expected)
+
+    def _expected_at(self, moved: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "b"]:
+        """Bends of likeness 1 in mm, where the start is moved to."""
+        return self._expected * larger(self._template, moved)
+
+    @property
+    def _finds_likeness(self) -> bool:
+        return self._priors.likeness is None and self._priors.bend is None
 
     def _row_faces(self, start: Start) -> Int[np.ndarray, "m"]:
         """The control face of every row of the priors."""
@@ -262,7 +273,7 @@ class Problem:
         """How the vertices of the surface move along their normals: the control face of each, and the derivatives."""
         surface, patches = js.refine(scheme, self._topology, control), self._patches
         face, slot = np.zeros((2, surface.vertices.shape[0]), np.int64)
-        corners = patches.vertices[patches.owner[:, None], patches.slots]
+        corners = self.corners
         face[corners], slot[corners] = patches.owner[:, None], patches.slots
         by_surface = np.asarray(self._differentiate(self.start(scheme, control)).by_surface, np.float64)
         return face, np.einsum("vdx,vx->vd", by_surface[face, slot], np.asarray(surface.normals, np.float64))
@@ -276,20 +287,18 @@ class Problem:
         width = 3 + (0 if self._zero.normals is None else 2)
         return width * np.arange(n)[:, None] + np.arange(3), normals
 
-    def _find_bend(self, found: _Equations, step: Float[np.ndarray, "n"], factor: SuperLU) -> None:
+    def _find_bend(self, found: _Equations, control: js.Control, step: Float[np.ndarray, "n"], factor: SuperLU) -> None:
         by = jacobian(self.elements, found.by_bend, self._faces.bend)[:, self.is_free]
-        next_one = next_precision(
-            self._precision,
-            found.bends + by @ step[self.is_free],
-            by,
-            self._faces.bend,
-            factorise(self._matrix(found.prior, self.loose, found.tied)).solve,
-            _first_part_of(factor),  # what the scan says of the bends, not knowing how its slices are shifted
-            self._around,
-        )
-        before = self._precision
-        self._set_bend(next_one)
-        self.annealed = bool(np.abs(np.log(self._precision / before)).mean() < _SETTLED)
+        bends, before, likeness = found.bends + by @ step[self.is_free], self._precision, self.likeness
+        solve = _first_part_of(factor)  # what the scan says of the bends, not knowing how its slices are shifted
+        if self._finds_likeness:
+            moved = moved_to(self._template, np.asarray(control.vertices, np.float64))
+            of_rows = before[self._faces.bend]
+            self.likeness = next_likeness(likeness, self._expected_at(moved), of_rows, bends, by, solve)
+        of_priors = factorise(self._matrix(found.prior, self.loose, found.tied)).solve
+        self._set_bend(next_precision(before, bends, by, self._faces.bend, of_priors, solve, self.around))
+        settled = np.abs(np.log(self._precision / before)).mean() < _SETTLED
+        self.annealed = bool(settled and abs(self.likeness - likeness) < _SETTLED_LIKENESS)
 
     def _count_determined(self, found: _Equations, factor: SuperLU) -> None:
         """The trace of the scan's part of the posterior, by random vectors."""
@@ -402,6 +411,16 @@ class Problem:
         return self._elements
 
     @property
+    def owner(self) -> Int[np.ndarray, "g"]:
+        """The control face of every face of the surface."""
+        return self._patches.owner
+
+    @property
+    def corners(self) -> Int[np.ndarray, "g 4"]:
+        """Vertices of every face of the surface; the last of a triangle twice."""
+        return self._patches.vertices[self.owner[:, None], self._patches.slots]
+
+    @property
     def topology(self) -> js.Topology:
         """Tables of the control mesh."""
         return self._topology
@@ -413,22 +432,23 @@ class Problem:
 
     def found(self) -> Found:
         """What a problem made anew has to be told, to know as much as this one."""
-        return Found(
-            self._template, self._precision, self.determined, self.annealed, self._anchors, self._symmetry, self._curve
-        )
+        of_bends = self._precision, self._expected, self.likeness
+        of_sweeps = self.determined, self.annealed
+        return Found(self._template, *of_bends, *of_sweeps, self._anchors, self._symmetry, self._curve)
 
     def tell(self, found: Found) -> None:
         """Take over what the sweeps of another problem found."""
-        self._precision, self.determined, self.annealed = found.bend_precision, found.determined, found.annealed
+        self._precision, self._expected, self.likeness = found.bend_precision, found.expected, found.likeness
+        self.determined, self.annealed = found.determined, found.annealed
 
     def memory(self) -> Memory:
         """What `recall` needs, to go on from here."""
-        return Memory(self._precision, self.determined, self.annealed, self._hold, self._last_step)
+        return Memory(self._precision, self.likeness, self.determined, self.annealed, self._hold, self._last_step)
 
     def recall(self, memory: Memory, scheme: js.AbstractScheme, control: js.Control) -> None:
         """Go on where another problem was, that made its first step from this scheme and control."""
         self._analyse(self.start(scheme, control))
-        self._precision, self.determined, self.annealed, self._hold, self._last_step = memory
+        self._precision, self.likeness, self.determined, self.annealed, self._hold, self._last_step = memory
 
     @property
     def _shift_precision(self) -> float:
@@ -486,3 +506,9 @@ def moved_to(template: AnyArray, vertices: AnyArray, xp: Any = np, *, scale: boo
     signs = xp.stack([xp.ones_like(s[0]), xp.ones_like(s[0]), xp.sign(xp.linalg.det(u @ vt))])
     factor = (s * signs).sum() / xp.maximum((a**2).sum(), np.finfo(a.dtype).tiny) if scale else 1.0
     return factor * a @ (u * signs[None] @ vt).T + there[None]
+
+
+def larger(template: AnyArray, moved: AnyArray, xp: Any = np) -> AnyArray:
+    """How many times as large as the template `[v, 3]` it is where it was moved to; see `moved_to`."""
+    size, before = (xp.linalg.norm(x - x.mean(axis=0)[None]) for x in (moved, template))
+    return size / xp.maximum(before, np.finfo(before.dtype).tiny)

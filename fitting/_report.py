@@ -48,6 +48,7 @@ class Report:
         inlier_share: share of the points within three times the noise.
         rms_inliers: root mean square distance of these.
         h: fitted tangent length coefficient, one or one a level; None where the scheme has none.
+        likeness: how much of the template's shape was expected, as given or as found; see `Priors.likeness`.
         rms_per_sweep: at the start, then after every sweep.
         coverage: share of the surface's area that the scan covers: where an inlier is paired with a place nearer
             than five times the median distance from such a place to the next, and not on the other side.
@@ -82,6 +83,7 @@ class Report:
     n_control_vertices: int
     n_faces: int
     h: float | list[float] | None
+    likeness: float
     rms_per_sweep: list[float]
     coverage: float
     mean_to_scan: float | None
@@ -134,6 +136,8 @@ class Report:
         ]
         if h:
             rows.append(("tangent length h", ", ".join(f"{value:.4f}" for value in h)))
+        if self.likeness:
+            rows.append(("likeness to the template", f"{self.likeness:.2f}"))
         if self.least_margin is not None:
             rows.append(("least margin of a normal", f"{self.least_margin:+.2f}"))
         if self.shifts:

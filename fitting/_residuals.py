@@ -4,6 +4,7 @@ Every row is over the standard deviation that is expected of it, so that half th
 logarithm of a probability: of the scan given the surface, times that of the surface.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -34,6 +35,10 @@ def _positive(value: object) -> Float[Array, ""]:
     return value
 
 
+def _if_given(converter: Callable[[object], Float[Array, ""]]) -> Callable[[object], Float[Array, ""] | None]:
+    return lambda value: None if value is None else converter(value)
+
+
 class Priors(eqx.Module):
     """What is known of a surface before it is measured, each as the standard deviation that is expected.
 
@@ -49,26 +54,26 @@ class Priors(eqx.Module):
             of control normals, by as much as they move the surface. Default: left out. The mirror plane moves along
             with the mesh; `fit` finds the partners, or is given them (see `find_symmetry`).
         likeness: how much of the control mesh's own bend asymmetry, where the fit starts, is expected of the surface,
-            from 0 to 1; `bend` is then of the departure from that. No standard deviation, unlike the others. Give about
-            0.7 where the control mesh is the same anatomy of another person: holes of the scan are then filled as it is
-            shaped. 0, the default, where its details say nothing.
+            from 0 to 1; `bend` is then of the departure from that, and holes of the scan are filled as the control mesh
+            is shaped. No standard deviation, unlike the others. None, the default: that which makes the scan most
+            probable, about 0.9 where the control mesh is the same anatomy of another person and about 0 where its
+            details say nothing of the scan's; and 0 where `bend` is given. Give 0 where the control mesh was made from
+            this very scan or fitted to it before, for its noise would be expected again.
         shift: of how far breathing displaced a slice of the scan, in mm, along each of two axes of the slice's plane.
 
     Raises:
         ValueError: a standard deviation is not positive, or the likeness not from 0 to 1.
     """
 
-    bend: Float[Array, ""] | None = eqx.field(
-        converter=lambda value: None if value is None else _positive(value), default=None
-    )
+    bend: Float[Array, ""] | None = eqx.field(converter=_if_given(_positive), default=None)
     stretch: Float[Array, ""] = eqx.field(converter=_positive, default=0.2)
     h: Float[Array, ""] = eqx.field(converter=_positive, default=0.05)
     symmetry: Float[Array, ""] = eqx.field(converter=_positive, default=np.inf)
     shift: Float[Array, ""] = eqx.field(converter=_positive, default=3.0)
-    likeness: Float[Array, ""] = eqx.field(converter=strong_float, default=0.0)
+    likeness: Float[Array, ""] | None = eqx.field(converter=_if_given(strong_float), default=None)
 
     def __check_init__(self):
-        if not bool((self.likeness >= 0) & (self.likeness <= 1)):
+        if self.likeness is not None and not bool((self.likeness >= 0) & (self.likeness <= 1)):
             raise ValueError(f"the likeness is a share, from 0 to 1; got {self.likeness}.")
 
 

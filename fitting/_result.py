@@ -41,6 +41,8 @@ class FitResult:
         noise: standard deviation in mm of the Gaussian part of the distances: the noise of the scan, and the detail
             that the control mesh is too coarse for.
         result: `optimistix.RESULTS.successful`, or why the fit stopped without having converged.
+        likeness: how much of the shape where the fit started, or of its template, was expected of the surface; see
+            `Priors.likeness`.
         recipe: the settings that the fit was given, to fit the next scan in the same way.
         start: the control where the fit started, with the normals that it took.
         shifts: how far each slice of the scan was shifted, in mm; no row where none was free to move.
@@ -77,6 +79,7 @@ class FitResult:
         self.result = result
         self.recipe = recipe
         self.start = start
+        self.likeness = problem.likeness
         self.shifts = np.zeros((0, 3)) if shifts is None else shifts.vectors
         self.slices = np.zeros(0, int) if shifts is None else shifts.slices
         self._problem, self._seen, self._shifts = problem, seen, shifts
@@ -89,9 +92,10 @@ class FitResult:
     def uncertainty(self) -> Uncertainty:
         """Standard deviations of the control vertices and of the surface's vertices, across the surface, in mm.
 
-        They say how far the surface may be off the anatomy because of noise, holes and few points; not how far it is
-        where the control mesh is too coarse for it. Shifts of slices count as unknown. Exact for up to 4,000 unknowns,
-        else from random draws.
+        They say how far the surface may be off the anatomy because of noise, holes and few points, and because the
+        control mesh is too coarse for it (see `Uncertainty.misfit`): where points of one control face lie off the
+        surface together. Errors that neighbouring points share, as those of one contour, count as such a misfit. Shifts
+        of slices count as unknown. Exact for up to 4,000 unknowns, else from random draws.
         """
         return self._uncertainty
 
@@ -197,6 +201,7 @@ class FitResult:
             n_control_vertices=self.control.vertices.shape[0],
             n_faces=self.surface.n_faces,
             h=None if self.scheme.h is None else np.asarray(self.scheme.h).tolist(),
+            likeness=self.likeness,
             rms_per_sweep=[float(value) for value in self.rms],
             coverage=float(areas_there.sum() / areas.sum()),
             mean_to_scan=float(share @ away) if known else None,

@@ -52,6 +52,8 @@ def save(folder: str | os.PathLike[str], result: FitResult) -> None:
         "start_normals": start.normals,
         "template": found.template,
         "bend_precision": found.bend_precision,
+        "expected": found.expected,
+        "likeness": found.likeness,
         "determined": found.determined,
         "annealed": found.annealed,
         "triangles": topology.control_faces[3],
@@ -171,8 +173,9 @@ def _restored(arrays: dict[str, np.ndarray]) -> FitResult:
     if "boundary_points" in arrays:
         curve = BoundaryCurve(arrays["boundary_points"], float(arrays["boundary_deviation"]))
     problem = Problem(recipe.scheme, topology, start, recipe.free, recipe.priors, anchors, symmetry, curve)
-    kept = (float(arrays["determined"]), bool(arrays["annealed"]))
-    problem.tell(Found(arrays["template"], arrays["bend_precision"], *kept, anchors))
+    of_bends = arrays["bend_precision"], arrays["expected"], float(arrays["likeness"])
+    of_sweeps = float(arrays["determined"]), bool(arrays["annealed"])
+    problem.tell(Found(arrays["template"], *of_bends, *of_sweeps, anchors))
     return FitResult(
         control=control,
         scheme=scheme,

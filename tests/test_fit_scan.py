@@ -93,7 +93,7 @@ def test_part_of_the_points_is_fitted_and_all_are_measured():
     rows = np.flatnonzero(np.isin(np.asarray(scan.points)[:, 0], np.asarray(part.scan.points)[:, 0]))
     np.testing.assert_allclose(found.distances[rows], part.distances, atol=1e-12)
     # Every point of the whole scan tells something of the surface.
-    assert np.median(found.uncertainty().surface) < 0.85 * np.median(part.uncertainty().surface)
+    assert np.median(found.uncertainty().control) < 0.85 * np.median(part.uncertainty().control)
     assert found.recipe.most_points == N_POINTS // 2
     assert fitting.Recipe.from_json(found.recipe.to_json()).most_points == N_POINTS // 2
     again = found.on(part.scan)

@@ -1,15 +1,17 @@
-"""The prior of likeness: holes are filled as the control mesh is shaped, where a fit is told that it should be."""
+"""The prior of likeness: holes are filled as the control mesh is shaped, as far as the rest of the scan is like it."""
 
 import functools
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from scans import noise, problem
 
 import fitting
 import jaxsubdiv as js
 from fitting import Free, Priors
+from fitting._evidence import next_likeness
 from fitting._problem import Problem
 
 SCHEME = js.Interpolating(1.2)
@@ -29,7 +31,7 @@ def in_hole(points) -> np.ndarray:
 
 
 @functools.cache
-def fitted(likeness: float) -> fitting.FitResult:
+def fitted(likeness: float | None) -> fitting.FitResult:
     """To half of a noisy scan, from the bent anatomy."""
     there = ~in_hole(problem().points)
     points = problem().points + noise()
@@ -43,17 +45,63 @@ def off(result: fitting.FitResult) -> float:
     return float(np.sqrt(np.mean(np.sum((points - np.asarray(on)) ** 2, axis=1))))
 
 
-def expected(priors: Priors, control: js.Control) -> np.ndarray | None:
+def expected(priors: Priors, control: js.Control) -> np.ndarray:
     of = Problem(SCHEME, problem().topology, template(), Free(), priors)
     return of.start(SCHEME, control).expected
 
 
 def test_hole_is_filled_as_the_control_mesh_is_shaped():
     assert off(fitted(0.7)) < 0.5 * off(fitted(0.0))
+    assert off(fitted(None)) < 1.1 * off(fitted(0.7))
+
+
+def test_likeness_is_found():
+    """About 1 of the same anatomy, bent; less, the more its bends have nothing to do with the scan's."""
+    assert 0.8 < fitted(None).likeness <= 1
+    leans = np.random.default_rng(0).normal(size=(12, 3))
+    others = (template().normals + part * leans for part in (0.2, 0.6))
+    likenesses = [
+        problem().fit(problem().points + noise(), control=js.Control(template().vertices, other)).likeness
+        for other in others
+    ]
+    assert likenesses[1] < 0.2 < likenesses[0] < 0.8
+
+
+def test_likeness_that_makes_measured_bends_most_probable():
+    """Of bends that are measured one by one, against the weighted regression that this then is."""
+    rng, n = np.random.default_rng(0), 300
+    expected, precision, data = rng.normal(size=n), rng.uniform(1, 4, n), rng.uniform(0.5, 2, n)
+    measured = 0.6 * expected + rng.normal(size=n) * np.sqrt(1 / precision + 1 / data)
+    likeness = 0.0
+    for _ in range(30):
+        # The most probable departures from what is expected, given the likeness.
+        left = (measured - likeness * expected) * data / (data + precision)
+        likeness = next_likeness(
+            likeness,
+            expected,
+            precision,
+            left,
+            sp.eye_array(n, format="csr"),
+            lambda sides: sides / (precision + data)[:, None],
+        )
+    weights = 1 / (1 / precision + 1 / data)
+    curvature = np.sum(weights * expected**2) + 1
+    assert abs(likeness - np.sum(weights * expected * measured) / curvature) < curvature**-0.5 < 0.1
+    assert 0.5 < likeness < 0.7
+
+
+def test_likeness_of_no_bends_stays_nothing():
+    nothing = sp.csr_array((4, 4))
+    assert next_likeness(0.0, np.zeros(4), np.ones(4), np.ones(4), nothing, lambda sides: sides) == 0
+
+
+def test_smoothness_that_is_given_has_nothing_to_be_like():
+    given = problem().fit(problem().points + noise(), control=template(), priors=Priors(bend=1.0), max_sweeps=3)
+    assert given.likeness == 0 and fitted(0.0).likeness == 0
 
 
 def test_likeness_is_a_share_of_the_bends_at_the_start():
-    assert expected(Priors(), template()) is None
+    assert not np.any(expected(Priors(likeness=0.0), template()))
     whole, half = (expected(Priors(likeness=share), template()) for share in (1.0, 0.5))
     surface = js.refine(SCHEME, problem().topology, template())
     np.testing.assert_allclose(whole, fitting._residuals.bend_asymmetry(problem().topology, surface), atol=1e-5)
@@ -69,15 +117,17 @@ def test_expected_bends_grow_with_the_mesh_and_not_with_its_place():
     np.testing.assert_allclose(thrice, 3 * once, atol=1e-4)
 
 
-def test_refit_and_saved_fit_know_the_likeness(tmp_path):
-    found = fitted(0.7)
+@pytest.mark.parametrize("likeness", [0.7, None])
+def test_refit_and_saved_fit_know_the_likeness(tmp_path, likeness):
+    found = fitted(likeness)
     points = jnp.asarray(found.scan.points)
     _, again = found.refit()(points)
     by = np.linalg.norm(np.asarray(again.vertices - found.control.vertices), axis=1)
     assert by.max() < 0.1 < np.abs(np.asarray(found.control.vertices - fitted(0.0).control.vertices)).max()
     found.save(tmp_path)
     loaded = fitting.load(tmp_path)
-    assert float(loaded.recipe.priors.likeness) == pytest.approx(0.7)
+    assert loaded.recipe.priors.likeness == (None if likeness is None else pytest.approx(0.7))
+    assert loaded.likeness == found.likeness > 0.5
     np.testing.assert_array_equal(loaded.uncertainty().control, found.uncertainty().control)
     _, third = loaded.refit()(points)
     np.testing.assert_allclose(third.vertices, again.vertices, atol=1e-3)
@@ -89,20 +139,55 @@ def test_refuses_what_is_no_share(share):
         Priors(likeness=share)
 
 
-def test_cohort_says_that_it_has_none():
-    with pytest.raises(ValueError, match=r"a cohort has no prior of likeness"):
-        fitting.fit_cohort(
-            SCHEME,
-            problem().topology,
-            template(),
-            [fitting.Scan(problem().points)],
-            priors=Priors(likeness=0.5),
-        )
+@functools.cache
+def cohort(likeness: float | None) -> fitting.Cohort:
+    scan = fitted(0.0).scan
+    tables = SCHEME, problem().topology, template()
+    return fitting.fit_cohort(*tables, [scan, scan], priors=Priors(likeness=likeness), pilot=fitted(likeness))
 
 
-def test_likeness_needs_a_template_that_is_not_split():
-    scan, priors = fitting.Scan(problem().points), Priors(likeness=0.5)
+def test_cohort_fills_holes_as_a_fit_does():
+    alone, like, smooth = fitted(None), cohort(None).result(1), cohort(0.0).result(1)
+    assert like.likeness == alone.likeness and smooth.likeness == 0
+    assert off(like) < 1.5 * off(alone) and off(like) < 0.7 * off(smooth)
+
+
+def test_only_faces_that_are_said_to_are_like_the_start():
+    scan, none = fitted(0.0).scan, np.zeros(problem().mesh.n_faces, bool)
+    tables = {"control": template(), "weights": scan.weights, "priors": Priors(likeness=0.7)}
+    of_none, of_all = (problem().fit(scan.points, alike=of, **tables) for of in (none, ~none))
+    assert off(of_none) == pytest.approx(off(fitted(0.0))) and off(of_all) == pytest.approx(off(fitted(0.7)))
+
+
+def test_split_mesh_is_expected_to_stay_as_it_is_where_there_are_no_points(monkeypatch):
+    fits = []
+
+    def fit_and_tell(scheme, topology, control, scan, **options):
+        found = fitting.fit(scheme, topology, control, scan, **options)
+        fits.append((control, options, found))
+        return found
+
+    monkeypatch.setattr(fitting._fit_scan, "fit", fit_and_tell)
+    mesh = js.ControlMesh(template().vertices, problem().mesh.faces, template().normals)
+    options = {"levels": 1, "pose": None, "tolerance_mm": 1e-3, "most_faces": 4 * mesh.n_faces, "max_sweeps": 8}
+    result = fitting.fit_scan(fitted(0.0).scan, mesh, scheme=SCHEME, throw=False, **options).result
+    (_, first, coarse), (start, then, _) = fits
+    assert first["priors"].likeness is None and "alike" not in first
+    assert then["priors"].likeness == 1 and result.recipe.priors.likeness is None
+    # Points that count lie on the parts of faces that are not to stay as they are, and those lie where the points do.
+    counted = coarse.inliers & (coarse.weights > 0)
+    of_points = np.unique(np.asarray(coarse.at.face)[counted] // 4)
+    np.testing.assert_array_equal(np.flatnonzero(~then["alike"].reshape(-1, 4).all(axis=1)), of_points)
+    faces = np.concatenate(
+        [np.asarray(start.vertices)[rows].mean(axis=1) for rows in result.control_mesh.faces.values()]
+    )
+    assert 8 <= then["alike"].sum() <= 28
+    assert faces[then["alike"], 0].max() < faces[~then["alike"], 0].mean()
+
+
+def test_mesh_made_from_the_scan_is_like_nothing():
+    scan = fitting.Scan(problem().points)
+    made = fitting.fit_scan(scan, faces=40, levels=2, throw=False, max_sweeps=2).result
+    assert made.likeness == 0 and made.recipe.priors.likeness is None
     with pytest.raises(ValueError, match=r"is to a template, and there is none: give one"):
-        fitting.fit_scan(scan, priors=priors)
-    with pytest.raises(ValueError, match=r"would be split for `tolerance_mm`: leave that out"):
-        fitting.fit_scan(scan, problem().mesh, priors=priors, tolerance_mm=0.1)
+        fitting.fit_scan(scan, priors=Priors(likeness=0.5))

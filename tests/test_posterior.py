@@ -27,6 +27,7 @@ from fitting._elements import (
 )
 from fitting._evidence import neighbourhoods, next_precision
 from fitting._free import no_offset
+from fitting._misfit import misfit_variances
 from fitting._residuals import Pairs, Start, bend_edges, control_edges, control_faces_of, prior_faces, residuals
 
 # Derivatives by elements
@@ -258,7 +259,47 @@ def test_uncertainty_is_larger_in_a_hole():
     whole, holed = (p.fit(points).uncertainty() for points in (p.points + noise(), scan))
     z = np.asarray(p.truth.vertices)[:, 2]
     assert np.all(holed.control[z > 12] > 1.5 * whole.control[z > 12])
-    np.testing.assert_allclose(whole.control, whole.surface[: len(z)], rtol=1e-9)
+    np.testing.assert_allclose(np.hypot(whole.control, whole.misfit[: len(z)]), whole.surface[: len(z)], rtol=1e-9)
+
+
+def test_uncertainty_knows_what_the_control_mesh_cannot_follow():
+    """Ripples of the anatomy, far shorter than a control edge and larger than what noise leaves uncertain."""
+    p = problem()
+    topology = js.build_topology(p.mesh, js.Interpolating(), 4)
+    smooth = js.refine(js.Interpolating(p.h), topology, p.truth)
+    x = np.asarray(smooth.vertices)
+    height = 0.5 * np.sin(x / 2.5 + np.arange(3)).prod(axis=1)
+    truth = js.RefinedSurface(jnp.asarray(x + height[:, None] * smooth.normals), smooth.normals, smooth.faces)
+    points = np.asarray(js.sample(truth, 8 * N_POINTS, jax.random.key(1)).points)
+    points = points + np.random.default_rng(1).normal(scale=SIGMA, size=points.shape)
+    found = p.fit(points, topology=js.build_topology(p.mesh, js.Interpolating(), 3))
+    vertices = np.asarray(found.surface.vertices)
+    off = np.linalg.norm(js.evaluate(truth, fitting.closest_points(truth, vertices)).points - vertices, axis=1)
+    deviation = found.uncertainty()
+    without = np.sqrt(deviation.surface**2 - deviation.misfit**2)
+    assert np.mean(off < without) < 0.45 and 0.55 < np.mean(off < deviation.surface) < 0.8
+
+
+def test_misfit_is_what_points_of_a_face_have_in_common_beyond_the_noise():
+    """Faces whose height is fitted three at a time, by the mean of their points: a mesh that is too coarse for them."""
+    rng, n_faces, n, sigma = np.random.default_rng(0), 3000, 12, 0.5
+    face = np.repeat(np.arange(n_faces), n)
+    around = sp.csr_array(np.kron(np.eye(n_faces // 300), np.full((300, 300), 1 / 300)))
+    weights = np.where(rng.uniform(size=len(face)) < 0.2, 0.0, 1.0)  # outliers, which say nothing
+    for height in (0.3, 0.0):
+        truth = height * rng.choice([-1.0, 1.0], size=n_faces)
+        measured = truth[face] + rng.normal(scale=sigma, size=len(face)) + 100 * (weights == 0)
+        of_three = face // 3
+        counts = np.bincount(of_three, weights)
+        fitted = np.bincount(of_three, weights * measured) / counts
+        off = fitted[np.arange(n_faces) // 3] - truth
+        variance = sigma**2 / counts
+        found = misfit_variances(measured - fitted[of_three], weights, variance[of_three], [face], around)
+        expected = np.mean(off**2) - np.mean(variance)
+        np.testing.assert_allclose(np.mean(found), expected, atol=0.1 * height**2 + 0.002)
+    alone = np.arange(n_faces)  # one point a face: nothing in common
+    none = misfit_variances(np.ones(n_faces), np.ones(n_faces), np.zeros(n_faces), [alone], around)
+    np.testing.assert_array_equal(none, 0)
 
 
 def test_uncertainty_from_draws_is_the_exact_one(monkeypatch):

@@ -39,7 +39,6 @@ NRICP_VERTICES = 2600  # registration moves vertices only: it needs more of them
 # Of a warp of 6 mm rms, waves this long leave about 2.4 mm rms after a similarity alignment, as two people differ.
 WARP_LENGTH = 145.0
 WAVES = 64
-LIKENESS = 0.7  # what `Priors` proposes for a template of the same anatomy
 VERSIONS = ("jaxsubdiv", "jax", "optimistix", "trimesh", "open3d", "pymeshlab", "pyacvd", "numpy")
 
 
@@ -259,7 +258,7 @@ def nearest(mesh: Trimesh, points: Float[np.ndarray, "p 3"]) -> Samples:
     return Samples(on, trimesh.unitize(np.sum(mesh.vertex_normals[mesh.faces[face]] * weights[:, :, None], axis=1)))
 
 
-def jaxsubdiv(problem: Problem, scheme: js.AbstractScheme, likeness: float = 0.0) -> fitting.FitResult:
+def jaxsubdiv(problem: Problem, scheme: js.AbstractScheme, likeness: float | None = None) -> fitting.FitResult:
     priors = fitting.Priors(likeness=likeness)
     template = problem.template(problem.n_vertices)
     mesh = js.ControlMesh(template.vertices, template.faces, template.vertex_normals)
@@ -338,7 +337,7 @@ def align(mesh: Trimesh, scan: Float[np.ndarray, "p 3"]) -> Trimesh:
 
 METHODS: dict[str, Callable[[Problem], Trimesh | fitting.FitResult]] = {
     "jaxsubdiv": lambda problem: jaxsubdiv(problem, js.Interpolating()),
-    "jaxsubdiv-likeness": lambda problem: jaxsubdiv(problem, js.Interpolating(), LIKENESS),
+    "jaxsubdiv-unlike": lambda problem: jaxsubdiv(problem, js.Interpolating(), likeness=0.0),
     "jaxsubdiv-no-template": jaxsubdiv_alone,
     "jaxsubdiv-split": jaxsubdiv_split,
     "loop": lambda problem: jaxsubdiv(problem, js.Loop()),
