@@ -123,7 +123,7 @@ def test_refit_and_saved_fit_know_the_likeness(tmp_path, likeness):
     points = jnp.asarray(found.scan.points)
     _, again = found.refit()(points)
     by = np.linalg.norm(np.asarray(again.vertices - found.control.vertices), axis=1)
-    assert by.max() < 0.1 < np.abs(np.asarray(found.control.vertices - fitted(0.0).control.vertices)).max()
+    assert by.max() < 0.1 * np.abs(np.asarray(found.control.vertices - fitted(0.0).control.vertices)).max()
     found.save(tmp_path)
     loaded = fitting.load(tmp_path)
     assert loaded.recipe.priors.likeness == (None if likeness is None else pytest.approx(0.7))
