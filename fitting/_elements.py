@@ -21,11 +21,23 @@ import jaxsubdiv as js
 from ._free import Free, Unknowns, no_offset
 from ._residuals import Pairs, Rows, Start, signed_distances, surface_and_priors
 
-_ROWS_A_BLOCK = 32
+_ROWS_A_BLOCK = 24
 _PAIRS_AT_ONCE = 65_536  # bounds the memory to a few hundred MB, however large the scan is
-_PATCHES_AT_ONCE = 512  # likewise
+_ENTRIES_AT_ONCE = 1 << 22  # of the faces' matrices, likewise
 _ONE_THREAD = 1 << 18  # multiplications of a product that OpenBLAS leaves to one
 _WRONG = 1e-3  # of a derivative: far more than rounding in float32, far less than a forgotten control vertex
+
+
+class Run(NamedTuple):
+    """Faces whose matrices are summed up at once, and where these go."""
+
+    faces: slice
+    source: Int[np.ndarray, "e"]
+    """Entries of the faces' matrices, one after the other, that lie in the lower triangle; equal places together."""
+    first: Int[np.ndarray, "k"]
+    """Where in `source` each place begins."""
+    place: Int[np.ndarray, "k"]
+    """Among the places of the lower triangle of all."""
 
 
 class Elements(NamedTuple):
@@ -38,9 +50,8 @@ class Elements(NamedTuple):
     seeds: Unknowns
     """Directions, one a leading row: many unknowns at once, no two of them in one face. The last is at random."""
     pattern: sp.csc_array
-    """Of the normal equations; its values are where in `pattern` each entry is."""
-    places: Int[np.ndarray, "f d d"]
-    """Entry of the pattern for every two unknowns of a face; one beyond the last where there is none."""
+    """Of the normal equations, which are symmetric; its values are the place of each entry in the lower triangle."""
+    runs: list[Run]
     n: int
     """Number of unknowns."""
 
@@ -112,9 +123,9 @@ def find_elements(topology: js.Topology, free: Free, start: Start, rings: int) -
     seeds[colour[rows // per_vertex] * per_vertex + rows % per_vertex, rows] = 1
     seeds[n_colours * per_vertex + last, n_vertices * per_vertex + last] = 1
     seeds[-1] = np.random.default_rng(0).normal(size=n)
-    pattern, places = _pattern(columns, n)
+    pattern, runs = _pattern(columns, n)
     directions = jax.vmap(lambda row: to_unknowns(row, zero))(jnp.asarray(seeds))
-    return Elements(columns, seeds_of, directions, pattern, places, n)
+    return Elements(columns, seeds_of, directions, pattern, runs, n)
 
 
 def to_unknowns(row: Float[Array, "n"], like: Unknowns) -> Unknowns:
@@ -195,20 +206,31 @@ def flat(unknowns: Unknowns) -> Shaped[np.ndarray, "n"]:
 
 
 def normal_matrix(
-    elements: Elements, by: Float[np.ndarray, "m d"], weights: Float[np.ndarray, "m"], face: Int[np.ndarray, "m"]
+    elements: Elements,
+    by: Float[np.ndarray, "m d"],
+    weights: Float[np.ndarray, "m"],
+    face: Int[np.ndarray, "m"],
 ) -> Float[np.ndarray, "_"]:
     """Values of J' W J in the pattern of the elements."""
     order = np.argsort(face, kind="stable")
-    counts = np.bincount(face, minlength=len(elements.columns))
-    blocks = -(-counts // _ROWS_A_BLOCK)
-    first = np.cumsum(counts) - counts
-    owner = np.repeat(np.arange(len(counts)), blocks)
-    number = np.arange(len(owner)) - np.repeat(np.cumsum(blocks) - blocks, blocks)
-    place = (first[owner] + number * _ROWS_A_BLOCK)[:, None] + np.arange(_ROWS_A_BLOCK)
-    inside = place < (first + counts)[owner][:, None]
-    rows = order[np.where(inside, place, 0)]
-    scaled = by[rows] * (np.sqrt(weights)[rows] * inside)[..., None]
-    return _summed(elements, owner, _products(scaled.transpose(0, 2, 1), scaled))
+    ends = np.searchsorted(face, np.arange(len(elements.columns) + 1), sorter=order)
+    roots, sums = np.sqrt(weights), _Sums(elements)
+
+    def product(first: Int[np.ndarray, "b"], last: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b d d"]:
+        place = first[:, None] + np.arange(_ROWS_A_BLOCK)
+        inside = place < last[:, None]
+        rows = order[np.where(inside, place, 0)]
+        scaled = by[rows] * (roots[rows] * inside)[..., None]
+        return _products(scaled.transpose(0, 2, 1), scaled)
+
+    for run in elements.runs:
+        first, last = ends[run.faces], ends[run.faces.start + 1 : run.faces.stop + 1]
+        matrices = product(first, last)
+        while len(more := np.flatnonzero(last - first > _ROWS_A_BLOCK)):  # few faces have so many rows
+            first = first + _ROWS_A_BLOCK
+            matrices[more] += product(first[more], last[more])
+        sums.add(run, matrices)
+    return sums.values()
 
 
 def _products(a: Float[np.ndarray, "b m k"], b: Float[np.ndarray, "b k n"]) -> Float[np.ndarray, "b m n"]:
@@ -218,12 +240,19 @@ def _products(a: Float[np.ndarray, "b m k"], b: Float[np.ndarray, "b k n"]) -> F
     return np.concatenate([np.matmul(a, b[..., i : i + columns]) for i in range(0, b.shape[2], columns)], axis=2)
 
 
-def _summed(
-    elements: Elements, face: Int[np.ndarray, "b"] | slice, products: Float[np.ndarray, "b d d"]
-) -> Float[np.ndarray, "_"]:
-    """Sums of matrices, a control face each, in the pattern of the elements."""
-    sums = np.bincount(elements.places[face].ravel(), products.ravel(), minlength=elements.pattern.nnz + 1)
-    return sums[:-1]
+class _Sums:
+    """Sums of symmetric matrices, a control face each, in the pattern of the elements."""
+
+    def __init__(self, elements: Elements):
+        self._pattern = elements.pattern
+        self._lower = np.zeros(int(elements.pattern.data.max(initial=-1)) + 1)
+
+    def add(self, run: Run, matrices: Float[np.ndarray, "n d d"]) -> None:
+        if len(run.first):
+            self._lower[run.place] += np.add.reduceat(matrices.ravel()[run.source], run.first)
+
+    def values(self) -> Float[np.ndarray, "_"]:
+        return self._lower[self._pattern.data]
 
 
 def equations_of_many(
@@ -245,15 +274,15 @@ def equations_of_many(
     distances = np.asarray(jax.jit(signed_distances)(found.surface, pairs), np.float64)
     corner_weights, directions = (np.asarray(part, np.float64) for part in (pairs.corner_weights, pairs.directions))
     face, width = patches.owner[at], 3 * patches.vertices.shape[1]
-    order, (n_faces, d) = np.argsort(face, kind="stable"), elements.columns.shape
-    values, gradient = np.zeros(elements.pattern.nnz), np.zeros(elements.n + 1)
-    for first in range(0, n_faces, _PATCHES_AT_ONCE):
-        those = slice(first, min(first + _PATCHES_AT_ONCE, n_faces))
-        n = those.stop - first
-        rows = order[slice(*np.searchsorted(face, (first, those.stop), sorter=order))]
+    order, d = np.argsort(face, kind="stable"), elements.columns.shape[1]
+    sums, gradient = _Sums(elements), np.zeros(elements.n + 1)
+    for run in elements.runs:
+        those = run.faces
+        n = those.stop - those.start
+        rows = order[slice(*np.searchsorted(face, (those.start, those.stop), sorter=order))]
         factors = (corner_weights[rows, :, None] * directions[rows, None, :]).reshape(-1, 12)
         coordinate = (3 * patches.slots[at[rows], :, None] + np.arange(3)).reshape(-1, 12)
-        place = (face[rows, None] - first) * width + coordinate
+        place = (face[rows, None] - those.start) * width + coordinate
         weighted = factors * weights[rows, None]
         sides = np.bincount(place.ravel(), (weighted * distances[rows, None]).ravel(), n * width)
         inner = np.bincount(
@@ -262,10 +291,10 @@ def equations_of_many(
             n * width * width,
         ).reshape(n, width, width)
         by = np.asarray(found.by_surface[those], np.float64).transpose(0, 1, 3, 2).reshape(n, width, d)
-        values += _summed(elements, those, _products(by.transpose(0, 2, 1), _products(inner, by)))
+        sums.add(run, _products(by.transpose(0, 2, 1), _products(inner, by)))
         by_unknowns = np.matmul(sides.reshape(n, 1, width), by)
         gradient += np.bincount(elements.columns[those].ravel(), by_unknowns.ravel(), elements.n + 1)
-    return values, gradient[:-1]
+    return sums.values(), gradient[:-1]
 
 
 def times_transposed(
@@ -311,14 +340,29 @@ def _colour(near: sp.csr_array) -> Int[np.ndarray, "v"]:
     return colour
 
 
-def _pattern(columns: Int[np.ndarray, "f d"], n: int) -> tuple[sp.csc_array, Int[np.ndarray, "f d d"]]:
-    row, column = np.broadcast_arrays(columns[:, :, None], columns[:, None, :])
-    there = (row < n) & (column < n)
-    keys, inverse = np.unique(column[there].astype(np.int64) * n + row[there], return_inverse=True)
-    places = np.full(row.shape, len(keys), np.int64)
-    places[there] = inverse
-    indptr = np.searchsorted(keys // n, np.arange(n + 1))
-    return sp.csc_array((np.arange(len(keys), dtype=float), keys % n, indptr), shape=(n, n)), places
+def _pattern(columns: Int[np.ndarray, "f d"], n: int) -> tuple[sp.csc_array, list[Run]]:
+    (n_faces, d), runs, keys_of_runs = columns.shape, [], []
+    one, other = np.tril_indices(d)
+    length = max(_ENTRIES_AT_ONCE // d**2, 1)
+    for start in range(0, n_faces, length):
+        those = columns[start : start + length]
+        row, column = np.maximum(those[:, one], those[:, other]), np.minimum(those[:, one], those[:, other])
+        face, entry = np.nonzero(row < n)
+        keys = column[face, entry].astype(np.int64) * n + row[face, entry]
+        order = np.argsort(keys, kind="stable")
+        keys_of_run, first = np.unique(keys[order], return_index=True)
+        source = (face * d**2 + one[entry] * d + other[entry])[order]
+        keys_of_runs.append(keys_of_run)
+        runs.append(Run(slice(start, start + len(those)), source, first, keys_of_run))
+    keys = np.unique(np.concatenate(keys_of_runs))
+    runs = [run._replace(place=np.searchsorted(keys, run.place)) for run in runs]
+    column, row = keys // n, keys % n
+    beside = np.flatnonzero(row != column)
+    both = np.append(np.arange(len(keys)), beside)
+    rows, columns_ = np.append(row, column[beside]), np.append(column, row[beside])
+    order = np.lexsort((rows, columns_))
+    indptr = np.searchsorted(columns_[order], np.arange(n + 1))
+    return sp.csc_array((both[order], rows[order], indptr), shape=(n, n)), runs
 
 
 def padded(

@@ -402,7 +402,7 @@ class Problem:
         """Distances, derivatives and control faces of pairs on these faces of the surface."""
         face = self._patches.owner[at]
         distances, by = differentiate_distances(found, pairs, face, self._patches.slots[at])
-        return np.asarray(distances, np.float64), np.asarray(by, np.float64), face
+        return np.asarray(distances, np.float64), np.asarray(by), face
 
     @property
     def elements(self) -> Elements:

@@ -97,11 +97,16 @@ def test_derivatives_by_elements_are_those_in_full(kind, levels):
     np.testing.assert_allclose(_elements.times_transposed(elements, by, weights, face), in_full.T @ weights, atol=1e-10)
     # Summed up a patch at a time, as it is done where there are many pairs.
     of_pairs, weights = in_full[: len(at)], weights[: len(at)]
-    for patches_at_once in (512, 5):
+    for at_once in (1 << 22, 5 * elements.columns.shape[1] ** 2):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(_elements, "_PATCHES_AT_ONCE", patches_at_once)
-            values, gradient = _elements.equations_of_many(elements, patches, found, pairs, weights, at)
+            patch.setattr(_elements, "_ENTRIES_AT_ONCE", at_once)
+            _, runs = _elements._pattern(elements.columns, elements.n)
+        assert len(runs) == (1 if at_once == 1 << 22 else -(-len(elements.columns) // 5))
+        parts = elements._replace(runs=runs)
+        values, gradient = _elements.equations_of_many(parts, patches, found, pairs, weights, at)
         np.testing.assert_allclose(matrix(values), of_pairs.T @ (weights[:, None] * of_pairs), atol=1e-10)
+        one_by_one = normal_matrix(parts, by[: len(at)], weights, face[: len(at)])
+        np.testing.assert_allclose(matrix(one_by_one), of_pairs.T @ (weights[:, None] * of_pairs), atol=1e-10)
         np.testing.assert_allclose(gradient, of_pairs.T @ (-0.1 * weights), atol=1e-10)
 
 
