@@ -29,7 +29,17 @@ from ._free import Free, Unknowns, apply_offset, edge_length, no_offset
 from ._look import Look, Surroundings, measure, surroundings
 from ._problem import FASTEST, HOLD, LEAST_LEFT, LET_GO, SOFTER, STEP, STIFFER, Found, Problem, larger, moved_to
 from ._recipe import Recipe
-from ._residuals import Priors, Start, bend_asymmetry, bend_edges, bends_of, control_edges, residuals
+from ._residuals import (
+    Expected,
+    Priors,
+    Start,
+    bend_asymmetry,
+    bend_edges,
+    bend_height,
+    control_edges,
+    residuals,
+    with_control_vertices,
+)
 from ._result import FitResult
 from ._robust import AbstractLoss, geman_mcclure
 from ._scan import Scan, ScanError
@@ -52,11 +62,15 @@ class _Common(NamedTuple):
     is_free: Float[Array | np.ndarray, "n"]
     bend: Float[Array, "b"]
     """1 / variance of every bend."""
+    height: Float[Array, "g"]
+    """Of the heights that are expected."""
     likeness: Float[Array, ""]
     determined: Float[Array, ""]
     """Degrees of freedom that a scan's points determine, about."""
     edges: Int[Array | np.ndarray, "e 2"]
     bend_edges: Int[Array | np.ndarray, "b 2"]
+    height_rows: Int[Array | np.ndarray, "g"]
+    """The bends whose heights are expected."""
     open_vertices: Bool[Array | np.ndarray, "w"]
     tolerance: Float[Array, ""]
 
@@ -85,8 +99,8 @@ class _State(NamedTuple):
     """Scale of the distances at the start."""
     stiff: Float[Array, ""]
     """1 / variance of the bends at the start."""
-    expected: Float[Array, "b"]
-    """Bends, as the start has them."""
+    expected: Expected
+    """Of the size of the start."""
     hold: Float[Array, "n"]
     step: Float[Array, "n"]
     rms: Float[Array, "sweeps"]
@@ -163,6 +177,7 @@ def fit_cohort(
     recipe = Recipe.of(scheme, topology, **settings)
     problem = Problem(scheme, topology, controls[0], free, priors)
     problem.tell(_strength(problem, priors, pilot))
+    precisions, height_rows = problem.prior_precisions(), problem.found().expected.rows
     dtype, masks = controls[0].vertices.dtype, free.of(scheme, topology.n_control_vertices)
     common = _Common(
         scheme=scheme,
@@ -171,11 +186,13 @@ def fit_cohort(
         loss=loss,
         zero=no_offset(free, scheme, controls[0]),
         is_free=jnp.asarray(flat(masks), dtype),
-        bend=jnp.asarray(problem.prior_precisions().bend, dtype),
+        bend=jnp.asarray(precisions.bend, dtype),
+        height=jnp.asarray(precisions.height, dtype),
         likeness=jnp.asarray(problem.likeness, dtype),
         determined=jnp.asarray(problem.determined, dtype),
         edges=control_edges(topology),
         bend_edges=bend_edges(topology),
+        height_rows=height_rows,
         open_vertices=boundary_vertices(js.refine(scheme, topology, controls[0])),
         tolerance=jnp.asarray(tolerance, dtype),
     )
@@ -219,6 +236,8 @@ def _strength(problem: Problem, priors: Priors, pilot: FitResult | None) -> Foun
     told = pilot._problem.found()
     if priors.bend is None:
         found = found._replace(bend_precision=told.bend_precision, likeness=told.likeness)
+        if not len(told.expected.rows):  # the pilot expected no heights, and knows no strength of them
+            found = found._replace(expected=told.expected)
     return found._replace(determined=told.determined)
 
 
@@ -274,7 +293,9 @@ def _first(common: _Common, subject: _Subject, max_sweeps: int) -> _State:
     x = subject.control.vertices
     none, nothing = jnp.zeros((), x.dtype), jnp.zeros_like(common.is_free)
     surface = _refined(common, common.scheme.h, subject.control)
-    expected = bends_of(common.topology, common.bend_edges, common.scheme, subject.control, surface)
+    own, rows = with_control_vertices(common.topology, common.scheme, subject.control, surface), common.height_rows
+    bends = common.likeness * bend_asymmetry(common.topology, own, common.bend_edges)
+    expected = Expected(bends, rows, bend_height(own, jnp.asarray(common.bend_edges)[rows]))
     unknown = jnp.full(max_sweeps + 1, jnp.nan, x.dtype)
     return _State(
         sweep=jnp.int32(0),
@@ -285,7 +306,7 @@ def _first(common: _Common, subject: _Subject, max_sweeps: int) -> _State:
         noise=none,
         widest=none,
         stiff=none,
-        expected=common.likeness * expected,
+        expected=expected,
         hold=_loosest(common, x),
         step=nothing,
         rms=unknown,
@@ -311,20 +332,21 @@ def _sweep(common: _Common, subject: _Subject, state: _State) -> _State:
 
     stiff = STIFFER / jnp.mean(bend_asymmetry(topology, surface, common.bend_edges) ** 2)
     stiffest = jnp.where(k > 0, state.stiff, stiff)
-    bend = jnp.maximum(common.bend, stiffest * SOFTER ** k.astype(edge.dtype))
+    least = stiffest * SOFTER ** k.astype(edge.dtype)
+    bend, height = jnp.maximum(common.bend, least), jnp.maximum(common.height, least)
     moved = surface_moved(js.RefinedSurface(*state.before, topology.faces), surface)
     change = jnp.abs(seen.robust_rms - state.robust_rms[jnp.maximum(k - 1, 0)])
     counted = jnp.maximum(jnp.sum(seen.weights > 0), 1).astype(edge.dtype)
     uncertainty = seen.scale * jnp.sqrt(control.vertices.shape[0] / counted)
     at_rest = common.tolerance * jnp.maximum(uncertainty, AT_REST * edge)
     at_noise = floor <= jnp.maximum(seen.noise, LEAST_NOISE * edge)
-    annealed = (k > 0) & at_noise & jnp.all(bend <= common.bend)
+    annealed = (k > 0) & at_noise & jnp.all(bend <= common.bend) & jnp.all(height <= common.height)
     converged = annealed & (jnp.maximum(moved, change) <= at_rest)
 
     step = lax.cond(
         converged | (k == state.rms.shape[0] - 1),
         lambda: jnp.zeros_like(state.step),
-        lambda: _solved(common, subject, state, seen, bend),
+        lambda: _solved(common, subject, state, seen, bend, height),
     )
     finite = jnp.all(jnp.isfinite(step))
     step = jnp.where(finite, step, 0.0)
@@ -349,23 +371,29 @@ def _sweep(common: _Common, subject: _Subject, state: _State) -> _State:
 
 
 def _solved(
-    common: _Common, subject: _Subject, state: _State, seen: Look, bend: Float[Array, "b"]
+    common: _Common,
+    subject: _Subject,
+    state: _State,
+    seen: Look,
+    bend: Float[Array, "b"],
+    height: Float[Array, "g"],
 ) -> Float[Array, "n"]:
     """A Gauss-Newton step of optimistix from here, pairs and weights held."""
     template = moved_to(subject.control.vertices, state.control.vertices, jnp)
     scheme = _with(common.scheme, state.h)
     tables = None, common.edges, common.bend_edges
-    expected = state.expected * larger(subject.control.vertices, template, jnp)
-    start = Start(scheme, common.topology, state.control, template, *tables, None, expected)
+    by = larger(subject.control.vertices, template, jnp)
+    start = Start(scheme, common.topology, state.control, template, *tables, None, state.expected.times(by, by))
     left = jnp.maximum(1 - common.determined / jnp.maximum(jnp.sum(seen.weights), 1.0), LEAST_LEFT)
-    deviations = jnp.sqrt(seen.precisions * left * subject.part), jnp.sqrt(bend), jnp.sqrt(state.hold)
+    deviations = tuple(map(jnp.sqrt, (seen.precisions * left * subject.part, bend, height, state.hold)))
 
     def rows(vector: Float[Array, "n"], args: Any) -> tuple[Float[Array, "m"], None]:
-        start, pairs, priors, (of_distance, of_bend, of_hold) = args
+        start, pairs, priors, (of_distance, of_bend, of_height, of_hold) = args
         found = residuals(_offset(common, vector), start, pairs)
         weighed = (
             of_distance * found.distance,
             of_bend * found.bend,
+            of_height * found.height,
             found.stretch / priors.stretch.astype(vector.dtype),
             found.margin,
             found.h / priors.h.astype(vector.dtype),

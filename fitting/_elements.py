@@ -244,15 +244,15 @@ class _Sums:
     """Sums of symmetric matrices, a control face each, in the pattern of the elements."""
 
     def __init__(self, elements: Elements):
-        self._pattern = elements.pattern
-        self._lower = np.zeros(int(elements.pattern.data.max(initial=-1)) + 1)
+        self._place = np.asarray(elements.pattern.data, np.intp)
+        self._lower = np.zeros(self._place.max(initial=-1) + 1)
 
     def add(self, run: Run, matrices: Float[np.ndarray, "n d d"]) -> None:
         if len(run.first):
             self._lower[run.place] += np.add.reduceat(matrices.ravel()[run.source], run.first)
 
     def values(self) -> Float[np.ndarray, "_"]:
-        return self._lower[self._pattern.data]
+        return self._lower[self._place]
 
 
 def equations_of_many(

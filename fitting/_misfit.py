@@ -35,9 +35,9 @@ def misfit_variances(
             patch are compared, of the finest patches that have enough.
         around: see `neighbourhoods`.
     """
-    counted = weights > 0
+    counted, n_faces = weights > 0, len(around.indptr) - 1
     if not counted.any():
-        return np.zeros(around.shape[0])
+        return np.zeros(n_faces)
     enough = [patch for patch in patches if counted.sum() >= _A_PATCH * len(np.unique(patch[counted]))]
     _, patch = np.unique((enough or patches[:1])[-1], return_inverse=True)
     weights = weights / np.mean(weights[counted])
@@ -49,7 +49,5 @@ def misfit_variances(
     mean_variance = np.bincount(patch, weights * variances) / (count + _TINY)
     pairs = count**2 - np.bincount(patch, weights**2)
     products = total**2 - np.bincount(patch, (weights * distances) ** 2) + pairs * mean_variance
-    pairs, products = (
-        around @ np.bincount(face, values / (count + _TINY), around.shape[0]) for values in (pairs, products)
-    )
+    pairs, products = (around @ np.bincount(face, values / (count + _TINY), n_faces) for values in (pairs, products))
     return np.where(pairs > _FEWEST, np.maximum(products, 0) / np.maximum(pairs, _FEWEST), 0)

@@ -36,15 +36,18 @@ from ._free import Free, Unknowns, edge_length, no_offset
 from ._look import Look
 from ._residuals import (
     Anchors,
+    Expected,
     Pairs,
     Priors,
     Rows,
     Start,
+    bend_asymmetry,
     bend_edges,
-    bends_of,
+    bend_height,
     control_edges,
     control_faces_of,
     prior_faces,
+    with_control_vertices,
 )
 from ._shifts import Border, Shifts, border_of
 from ._symmetry import Mirror, Symmetry, Ties, mirror_at, ties
@@ -75,6 +78,7 @@ class _Equations(NamedTuple):
     """Of the priors' matrix."""
     gradient: Float[np.ndarray, "n"]
     bends: Float[np.ndarray, "b"]
+    """And their heights."""
     by_bend: Float[np.ndarray, "b d"]
     ties: Ties | None
     """Of the prior of symmetry, whose rows lie in no control face."""
@@ -92,10 +96,10 @@ class Found(NamedTuple):
 
     template: Float[np.ndarray, "v 3"]
     """Control vertices where the fit started, in mm."""
-    bend_precision: Float[np.ndarray, "f"]
-    """1 / variance of the bends, a control face; empty before the first sweep."""
-    expected: Float[np.ndarray, "b"]
-    """Bend asymmetry of likeness 1 in mm, at the size of the start."""
+    bend_precision: Float[np.ndarray, "s"]
+    """1 / variance of the bends, a control face, and then of their heights; empty before the first sweep."""
+    expected: Expected
+    """Of likeness 1, and at the size of the start."""
     likeness: float
     determined: float
     annealed: bool
@@ -107,7 +111,7 @@ class Found(NamedTuple):
 class Memory(NamedTuple):
     """What a problem knows after a sweep, and needs for the next."""
 
-    bend_precision: Float[np.ndarray, "f"]
+    bend_precision: Float[np.ndarray, "s"]
     likeness: float
     determined: float
     annealed: bool
@@ -139,16 +143,22 @@ class Problem:
         # A surface of any shape: only to tell which face lies where.
         surface = js.refine(scheme, topology, control)
         owner = control_faces_of(topology, surface, control)
-        self._patches = find_patches(surface, owner, sum(map(len, topology.control_faces.values())))
+        self._n_faces = sum(map(len, topology.control_faces.values()))
+        self._patches = find_patches(surface, owner, self._n_faces)
         self._faces = prior_faces(scheme, topology, anchors, owner, 0 if masks.h is None else masks.h.size)
         self._edges, self._bend_edges = control_edges(topology), bend_edges(topology)
-        self._bends = np.asarray(bends_of(topology, self._bend_edges, scheme, control, surface), np.float64)
-        self._expected = self._bends if alike is None else np.where(alike[self._faces.bend], self._bends, 0.0)
+        own = with_control_vertices(topology, scheme, control, surface)
+        self._bends = np.asarray(bend_asymmetry(topology, own, self._bend_edges), np.float64)
+        heights = np.asarray(bend_height(own, self._bend_edges), np.float64)
+        there = np.ones(len(heights), bool) if alike is None else alike[self._faces.bend]
+        if priors.bend is not None or (priors.likeness is not None and priors.likeness == 0):
+            there[:] = False
+        self._expect(Expected(np.where(there, self._bends, 0.0), np.flatnonzero(there), heights[there]))
         self.around = neighbourhoods(topology)
         self._folds = Folds(topology)
         self._edge = float(edge_length(topology, control.vertices))
         self._elements: Elements | None = None
-        self._precision: Float[np.ndarray, "f"] = np.zeros(0)  # of the bends, a control face; found in the first sweep
+        self._precision: Float[np.ndarray, "s"] = np.zeros(0)  # see `Found`; from the first sweep on
         self.likeness = 0.0 if priors.likeness is None else float(priors.likeness)
         self._hold = np.full(self.is_free.shape, (STEP * self._edge) ** -2)
         self.loose = self._hold.copy()
@@ -202,7 +212,7 @@ class Problem:
         rows, by_priors = jax.tree.map(lambda values: np.asarray(values, np.float64), (found.rows, found.by_rows))
         if not len(self._precision):
             first = 1 / max(float(np.mean(np.square(self._bends))) / STIFFER, _TINY)
-            self._set_bend(np.full(len(elements.columns), first))
+            self._set_bend(np.full((2 if len(self._expected.rows) else 1) * self._n_faces, first))
         weights, of_priors = np.concatenate(self.prior_precisions()), self._row_faces(start)
         gradient += times_transposed(elements, by_priors, weights * np.concatenate(rows[1:]), of_priors)
         prior = normal_matrix(elements, by_priors, weights, of_priors)
@@ -214,7 +224,8 @@ class Problem:
             of_prior = self._shift_precision * shifts.within.ravel()
             across = sp.csr_array(border.across[self.is_free, :])
             border = border._replace(across=across, gradient=border.gradient + of_prior)
-        return _Equations(data, prior, gradient, np.asarray(rows.bend), by_priors[: len(rows.bend)], tied, border)
+        bends = np.append(rows.bend, rows.height)
+        return _Equations(data, prior, gradient, bends, by_priors[: len(bends)], tied, border)
 
     def mirror(self, control: js.Control) -> Mirror | None:
         """The prior of symmetry about here; None where there is none."""
@@ -229,6 +240,7 @@ class Problem:
         return Rows(
             distance=np.zeros(0),
             bend=self._precision[faces.bend],
+            height=self._precision[self._height_strengths],
             stretch=np.full(len(faces.stretch), stretch),
             margin=np.ones(len(faces.margin)),
             landmark=np.ones(len(faces.landmark)),
@@ -245,16 +257,25 @@ class Problem:
         """The arguments of the residuals, for a sweep that starts here."""
         moved = moved_to(self._template, np.asarray(control.vertices, np.float64))
         template = jnp.asarray(moved, control.vertices.dtype)
-        expected = jnp.asarray(self.likeness * self._expected_at(moved), template.dtype)
+        by = larger(self._template, moved)
+        expected = self._expected.times(self.likeness * by, by)
+        expected = Expected(
+            *(jnp.asarray(part, template.dtype if part.dtype.kind == "f" else None) for part in expected)
+        )
         rim = None
         if self._curve is not None:
             rim = pair_with_boundary(self._curve, js.refine(scheme, self._topology, control))
         tables = self._anchors, self._edges, self._bend_edges
         return Start(scheme, self._topology, control, template, *tables, rim, expected)
 
-    def _expected_at(self, moved: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "b"]:
-        """Bends of likeness 1 in mm, where the start is moved to."""
-        return self._expected * larger(self._template, moved)
+    def _expect(self, expected: Expected) -> None:
+        self._expected = expected
+        self._faces = self._faces._replace(height=self._faces.bend[expected.rows])
+
+    @property
+    def _height_strengths(self) -> Int[np.ndarray, "g"]:
+        """Which strength that of each height is: those of the faces, after those of the bends."""
+        return self._faces.height + self._n_faces
 
     @property
     def _finds_likeness(self) -> bool:
@@ -288,15 +309,18 @@ class Problem:
         return width * np.arange(n)[:, None] + np.arange(3), normals
 
     def _find_bend(self, found: _Equations, control: js.Control, step: Float[np.ndarray, "n"], factor: SuperLU) -> None:
-        by = jacobian(self.elements, found.by_bend, self._faces.bend)[:, self.is_free]
+        faces, n = self._faces, len(self._bends)
+        by = jacobian(self.elements, found.by_bend, np.append(faces.bend, faces.height))[:, self.is_free]
         bends, before, likeness = found.bends + by @ step[self.is_free], self._precision, self.likeness
+        strength = np.append(faces.bend, self._height_strengths)
         solve = _first_part_of(factor)  # what the scan says of the bends, not knowing how its slices are shifted
         if self._finds_likeness:
             moved = moved_to(self._template, np.asarray(control.vertices, np.float64))
-            of_rows = before[self._faces.bend]
-            self.likeness = next_likeness(likeness, self._expected_at(moved), of_rows, bends, by, solve)
+            expected = larger(self._template, moved) * self._expected.bends
+            self.likeness = next_likeness(likeness, expected, before[faces.bend], bends[:n], by[:n], solve)
         of_priors = factorise(self._matrix(found.prior, self.loose, found.tied)).solve
-        self._set_bend(next_precision(before, bends, by, self._faces.bend, of_priors, solve, self.around))
+        around = sp.csr_array(sp.block_diag([self.around] * (len(before) // self._n_faces)))
+        self._set_bend(next_precision(before, bends, by, strength, of_priors, solve, around))
         settled = np.abs(np.log(self._precision / before)).mean() < _SETTLED
         self.annealed = bool(settled and abs(self.likeness - likeness) < _SETTLED_LIKENESS)
 
@@ -438,7 +462,8 @@ class Problem:
 
     def tell(self, found: Found) -> None:
         """Take over what the sweeps of another problem found."""
-        self._precision, self._expected, self.likeness = found.bend_precision, found.expected, found.likeness
+        self._precision, self.likeness = found.bend_precision, found.likeness
+        self._expect(found.expected)
         self.determined, self.annealed = found.determined, found.annealed
 
     def memory(self) -> Memory:

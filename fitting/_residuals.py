@@ -5,7 +5,7 @@ logarithm of a probability: of the scan given the surface, times that of the sur
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -54,11 +54,12 @@ class Priors(eqx.Module):
             of control normals, by as much as they move the surface. Default: left out. The mirror plane moves along
             with the mesh; `fit` finds the partners, or is given them (see `find_symmetry`).
         likeness: how much of the control mesh's own bend asymmetry, where the fit starts, is expected of the surface,
-            from 0 to 1; `bend` is then of the departure from that, and holes of the scan are filled as the control mesh
-            is shaped. No standard deviation, unlike the others. None, the default: that which makes the scan most
-            probable, about 0.9 where the control mesh is the same anatomy of another person and about 0 where its
-            details say nothing of the scan's; and 0 where `bend` is given. Give 0 where the control mesh was made from
-            this very scan or fitted to it before, for its noise would be expected again.
+            from 0 to 1; `bend` is then of the departure from that. No standard deviation, unlike the others. Unless it
+            is 0, the control mesh's curvature is expected too (see `bend_height`), as closely as the scan shows place
+            by place: holes of the scan are filled as the control mesh is shaped. None, the default: the likeness that
+            makes the scan most probable, about 0.9 where the control mesh is the same anatomy of another person and
+            about 0 where its details say nothing of the scan's; and 0 where `bend` is given. Give 0 where the control
+            mesh was made from this very scan or fitted to it before, for its noise would be expected again.
         shift: of how far breathing displaced a slice of the scan, in mm, along each of two axes of the slice's plane.
 
     Raises:
@@ -100,6 +101,20 @@ class Anchors(NamedTuple):
     """Standard deviations in mm."""
 
 
+class Expected(NamedTuple):
+    """What is expected of bends, in mm; see `Priors.likeness`."""
+
+    bends: Float[Array | np.ndarray, "b"]
+    """Their asymmetry."""
+    rows: Int[Array | np.ndarray, "g"]
+    """The bends whose heights are expected."""
+    heights: Float[Array | np.ndarray, "g"]
+
+    def times(self, bends: Any, heights: Any) -> "Expected":
+        """With factors of the bends and of the heights."""
+        return Expected(bends * self.bends, self.rows, heights * self.heights)
+
+
 class Start(NamedTuple):
     """Where a sweep starts, and what it holds fixed: the arguments of its residuals."""
 
@@ -114,8 +129,8 @@ class Start(NamedTuple):
     bend_edges: Int[Array | np.ndarray, "b 2"]
     """Edges of which the bends are compared."""
     rim: Rim | None = None
-    expected: Float[Array, "b"] | None = None
-    """Bend asymmetry that is expected, in mm; None is 0."""
+    expected: Expected | None = None
+    """None is a bend asymmetry of 0, and any heights."""
 
 
 class Rows(NamedTuple):
@@ -123,6 +138,7 @@ class Rows(NamedTuple):
 
     distance: Float[Array | np.ndarray, "p"]
     bend: Float[Array | np.ndarray, "b"]
+    height: Float[Array | np.ndarray, "g"]
     stretch: Float[Array | np.ndarray, "s"]
     """Three a control edge, as parts of its length."""
     margin: Float[Array | np.ndarray, "c"]
@@ -152,10 +168,15 @@ def surface_and_priors(offset: Unknowns, start: Start) -> tuple[Float[Array, "v 
     scheme, control = apply_offset(start.topology, start.scheme, start.control, offset)
     surface = js.refine(scheme, start.topology, control)
     dtype = surface.vertices.dtype
-    none, bends = jnp.zeros((0,), dtype), bends_of(start.topology, start.bend_edges, scheme, control, surface)
+    none, own = jnp.zeros((0,), dtype), with_control_vertices(start.topology, scheme, control, surface)
+    bends, heights = bend_asymmetry(start.topology, own, start.bend_edges), none
+    if start.expected is not None:
+        bends = bends - start.expected.bends
+        heights = bend_height(own, jnp.asarray(start.bend_edges)[start.expected.rows]) - start.expected.heights
     return surface.vertices, Rows(
         distance=none,
-        bend=bends if start.expected is None else bends - start.expected,
+        bend=bends,
+        height=heights,
         stretch=_stretch(start, control),
         margin=_margin_rows(start.topology, control) if scheme.uses_normals else none,
         landmark=none if start.anchors is None else _anchor_rows(start.anchors, surface),
@@ -179,8 +200,22 @@ def bend_asymmetry(
         edges: default: those of the first level, or the control edges where there is one level only.
     """
     a, b = jnp.asarray(bend_edges(topology) if edges is None else edges).T
-    d = take(surface.vertices, b) - take(surface.vertices, a)
-    return 0.5 * dot(take(surface.normals, a) + take(surface.normals, b), d)[:, 0]
+    return 0.5 * _along(surface, a, b, take(surface.normals, a) + take(surface.normals, b))
+
+
+def bend_height(surface: js.RefinedSurface, edges: Int[Array | np.ndarray, "g 2"]) -> Float[Array, "g"]:
+    """How high the ends of an edge lie over the tangent planes of each other, in mm, on average; below is negative.
+
+    (n_a - n_b) . (x_b - x_a) / 2: half the curvature along the edge, times its length squared.
+    """
+    a, b = jnp.asarray(edges).T
+    return 0.5 * _along(surface, a, b, take(surface.normals, a) - take(surface.normals, b))
+
+
+def _along(
+    surface: js.RefinedSurface, a: Int[Array, "b"], b: Int[Array, "b"], vectors: Float[Array, "b 3"]
+) -> Float[Array, "b"]:
+    return dot(vectors, take(surface.vertices, b) - take(surface.vertices, a))[:, 0]
 
 
 def bend_edges(topology: js.Topology) -> Int[Array | np.ndarray, "b 2"]:
@@ -201,18 +236,14 @@ def splits_in_four(topology: js.Topology) -> bool:
     return all(len(topology.faces[size]) == n * len(faces) for size, faces in topology.control_faces.items())
 
 
-def bends_of(
-    topology: js.Topology,
-    edges: Int[Array | np.ndarray, "b 2"],
-    scheme: js.AbstractScheme,
-    control: js.Control,
-    surface: js.RefinedSurface,
-) -> Float[Array, "b"]:
-    """Bend asymmetry of a control mesh that was refined to this surface."""
-    if not scheme.is_primal:  # the surface has no vertices of the control mesh
-        normals = js.estimate_normals(topology.control_fans, control.vertices)
-        surface = js.RefinedSurface(control.vertices, normals, topology.control_faces)
-    return bend_asymmetry(topology, surface, edges)
+def with_control_vertices(
+    topology: js.Topology, scheme: js.AbstractScheme, control: js.Control, surface: js.RefinedSurface
+) -> js.RefinedSurface:
+    """The surface that a control mesh was refined to; or the mesh itself, where its vertices are not on that."""
+    if scheme.is_primal:
+        return surface
+    normals = js.estimate_normals(topology.control_fans, control.vertices)
+    return js.RefinedSurface(control.vertices, normals, topology.control_faces)
 
 
 def _stretch(start: Start, control: js.Control) -> Float[Array, "s"]:
@@ -248,6 +279,7 @@ class RowFaces(NamedTuple):
 
     distance: Int[np.ndarray, "p"]
     bend: Int[np.ndarray, "b"]
+    height: Int[np.ndarray, "g"]
     stretch: Int[np.ndarray, "s"]
     margin: Int[np.ndarray, "c"]
     landmark: Int[np.ndarray, "l"]
@@ -259,7 +291,7 @@ class RowFaces(NamedTuple):
 def prior_faces(
     scheme: js.AbstractScheme, topology: js.Topology, anchors: Anchors | None, owner: Int[np.ndarray, "g"], n_h: int
 ) -> RowFaces:
-    """The faces of all rows but the distances'.
+    """The faces of all rows but the distances' and the heights'.
 
     Args:
         owner: the control face of every face of the surface.
@@ -276,6 +308,7 @@ def prior_faces(
     return RowFaces(
         distance=np.zeros(0, int),
         bend=bends,
+        height=np.zeros(0, int),
         stretch=np.repeat(of_edge, 3),
         margin=np.concatenate(corners) if scheme.uses_normals else np.zeros(0, int),
         landmark=np.zeros(0, int) if anchors is None else np.repeat(owner[np.asarray(anchors.face)], 3),

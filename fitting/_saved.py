@@ -19,7 +19,7 @@ from ._boundary import BoundaryCurve
 from ._look import Look
 from ._problem import Found, Problem
 from ._recipe import Recipe
-from ._residuals import Anchors, Pairs
+from ._residuals import Anchors, Expected, Pairs
 from ._result import FitResult
 from ._scan import Scan
 from ._shifts import find_shifts
@@ -52,7 +52,6 @@ def save(folder: str | os.PathLike[str], result: FitResult) -> None:
         "start_normals": start.normals,
         "template": found.template,
         "bend_precision": found.bend_precision,
-        "expected": found.expected,
         "likeness": found.likeness,
         "determined": found.determined,
         "annealed": found.annealed,
@@ -69,6 +68,7 @@ def save(folder: str | os.PathLike[str], result: FitResult) -> None:
         "rms": result.rms,
         "robust_rms": result.robust_rms,
     }
+    arrays |= {f"expected_{name}": value for name, value in found.expected._asdict().items()}
     optional = {"h": result.scheme.h} | {f"scan_{name}": value for name, value in vars(scan).items()}
     if result._shifts is not None:
         optional |= {"slices": result.slices, "shifts": result.shifts}
@@ -173,7 +173,8 @@ def _restored(arrays: dict[str, np.ndarray]) -> FitResult:
     if "boundary_points" in arrays:
         curve = BoundaryCurve(arrays["boundary_points"], float(arrays["boundary_deviation"]))
     problem = Problem(recipe.scheme, topology, start, recipe.free, recipe.priors, anchors, symmetry, curve)
-    of_bends = arrays["bend_precision"], arrays["expected"], float(arrays["likeness"])
+    expected = Expected(*(arrays[f"expected_{name}"] for name in Expected._fields))
+    of_bends = arrays["bend_precision"], expected, float(arrays["likeness"])
     of_sweeps = float(arrays["determined"]), bool(arrays["annealed"])
     problem.tell(Found(arrays["template"], *of_bends, *of_sweeps, anchors))
     return FitResult(
