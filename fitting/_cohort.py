@@ -99,8 +99,6 @@ class _State(NamedTuple):
     """Scale of the distances at the start."""
     stiff: Float[Array, ""]
     """1 / variance of the bends at the start."""
-    expected: Expected
-    """Of the size of the start."""
     hold: Float[Array, "n"]
     step: Float[Array, "n"]
     rms: Float[Array, "sweeps"]
@@ -273,9 +271,11 @@ def _stacked(controls: list[js.Control], scans: Sequence[Scan], at_once: int) ->
 @eqx.filter_jit
 def _run(common: _Common, subjects: _Subject, max_sweeps: int, at_once: int) -> _State:
     def one(subject: _Subject) -> _State:
-        state = _first(common, subject, max_sweeps)
+        state, expected = _first(common, subject, max_sweeps), _expected(common, subject)
         return lax.while_loop(
-            lambda s: (s.sweep <= max_sweeps) & ~s.converged & s.finite, lambda s: _sweep(common, subject, s), state
+            lambda s: (s.sweep <= max_sweeps) & ~s.converged & s.finite,
+            lambda s: _sweep(common, subject, expected, s),
+            state,
         )
 
     return lax.map(one, subjects, batch_size=None if at_once == 1 else at_once)
@@ -289,24 +289,28 @@ def _with(scheme: js.AbstractScheme, h: Float[Array, "..."] | None) -> js.Abstra
     return scheme if h is None else eqx.tree_at(lambda s: s.h, scheme, h)
 
 
-def _first(common: _Common, subject: _Subject, max_sweeps: int) -> _State:
-    x = subject.control.vertices
-    none, nothing = jnp.zeros((), x.dtype), jnp.zeros_like(common.is_free)
+def _expected(common: _Common, subject: _Subject) -> Expected:
+    """Of bends, at the size of the start."""
     surface = _refined(common, common.scheme.h, subject.control)
     own, rows = with_control_vertices(common.topology, common.scheme, subject.control, surface), common.height_rows
     bends = common.likeness * bend_asymmetry(common.topology, own, common.bend_edges)
-    expected = Expected(bends, rows, bend_height(own, jnp.asarray(common.bend_edges)[rows]))
+    return Expected(bends, rows, bend_height(own, jnp.asarray(common.bend_edges)[rows]))
+
+
+def _first(common: _Common, subject: _Subject, max_sweeps: int) -> _State:
+    x = subject.control.vertices
+    none, nothing = jnp.zeros((), x.dtype), jnp.zeros_like(common.is_free)
+    shapes = jax.eval_shape(_refined, common, common.scheme.h, subject.control)
     unknown = jnp.full(max_sweeps + 1, jnp.nan, x.dtype)
     return _State(
         sweep=jnp.int32(0),
         h=common.scheme.h,
         control=subject.control,
-        before=(jnp.zeros_like(surface.vertices), jnp.zeros_like(surface.normals)),
+        before=(jnp.zeros_like(shapes.vertices), jnp.zeros_like(shapes.normals)),
         weights=jnp.zeros_like(subject.scan.points[:, 0]),
         noise=none,
         widest=none,
         stiff=none,
-        expected=expected,
         hold=_loosest(common, x),
         step=nothing,
         rms=unknown,
@@ -316,7 +320,7 @@ def _first(common: _Common, subject: _Subject, max_sweeps: int) -> _State:
     )
 
 
-def _sweep(common: _Common, subject: _Subject, state: _State) -> _State:
+def _sweep(common: _Common, subject: _Subject, expected: Expected, state: _State) -> _State:
     """Look where the scan lies, and, unless the surface came to rest, take a step.
 
     Looking comes first, so that the last step is judged too and the program holds one search.
@@ -346,7 +350,7 @@ def _sweep(common: _Common, subject: _Subject, state: _State) -> _State:
     step = lax.cond(
         converged | (k == state.rms.shape[0] - 1),
         lambda: jnp.zeros_like(state.step),
-        lambda: _solved(common, subject, state, seen, bend, height),
+        lambda: _solved(common, subject, expected, state, seen, bend, height),
     )
     finite = jnp.all(jnp.isfinite(step))
     step = jnp.where(finite, step, 0.0)
@@ -360,7 +364,6 @@ def _sweep(common: _Common, subject: _Subject, state: _State) -> _State:
         noise=seen.noise,
         widest=jnp.where(k > 0, state.widest, seen.scale),
         stiff=stiffest,
-        expected=state.expected,
         hold=_held(common, state, step),
         step=step,
         rms=state.rms.at[k].set(seen.rms),
@@ -373,6 +376,7 @@ def _sweep(common: _Common, subject: _Subject, state: _State) -> _State:
 def _solved(
     common: _Common,
     subject: _Subject,
+    expected: Expected,
     state: _State,
     seen: Look,
     bend: Float[Array, "b"],
@@ -383,7 +387,7 @@ def _solved(
     scheme = _with(common.scheme, state.h)
     tables = None, common.edges, common.bend_edges
     by = larger(subject.control.vertices, template, jnp)
-    start = Start(scheme, common.topology, state.control, template, *tables, None, state.expected.times(by, by))
+    start = Start(scheme, common.topology, state.control, template, *tables, None, expected.times(by, by))
     left = jnp.maximum(1 - common.determined / jnp.maximum(jnp.sum(seen.weights), 1.0), LEAST_LEFT)
     deviations = tuple(map(jnp.sqrt, (seen.precisions * left * subject.part, bend, height, state.hold)))
 

@@ -186,7 +186,7 @@ def roughness(result: fitting.FitResult) -> float:
 
 def test_bend_prior_that_is_given_smooths_as_it_says():
     stiff, found, loose = (
-        problem().fit(problem().points + noise(), priors=Priors(bend=bend), tolerance=0.05)
+        problem().fit(problem().points + noise(), priors=Priors(bend=bend, likeness=0.0), tolerance=0.05)
         for bend in (0.01, None, 20.0)
     )
     assert roughness(stiff) < roughness(found) < roughness(loose)
