@@ -64,7 +64,8 @@ class _Common(NamedTuple):
     """1 / variance of every bend."""
     height: Float[Array, "g"]
     """Of the heights that are expected."""
-    likeness: Float[Array, ""]
+    likeness: Float[Array, "b"]
+    """Of every bend."""
     determined: Float[Array, ""]
     """Degrees of freedom that a scan's points determine, about."""
     edges: Int[Array | np.ndarray, "e 2"]
@@ -175,7 +176,7 @@ def fit_cohort(
     recipe = Recipe.of(scheme, topology, **settings)
     problem = Problem(scheme, topology, controls[0], free, priors)
     problem.tell(_strength(problem, priors, pilot))
-    precisions, height_rows = problem.prior_precisions(), problem.found().expected.rows
+    precisions, expected = problem.prior_precisions(), problem.found().expected
     dtype, masks = controls[0].vertices.dtype, free.of(scheme, topology.n_control_vertices)
     common = _Common(
         scheme=scheme,
@@ -186,11 +187,11 @@ def fit_cohort(
         is_free=jnp.asarray(flat(masks), dtype),
         bend=jnp.asarray(precisions.bend, dtype),
         height=jnp.asarray(precisions.height, dtype),
-        likeness=jnp.asarray(problem.likeness, dtype),
+        likeness=jnp.asarray(problem.likeness * (expected.bends != 0), dtype),
         determined=jnp.asarray(problem.determined, dtype),
         edges=control_edges(topology),
         bend_edges=bend_edges(topology),
-        height_rows=height_rows,
+        height_rows=expected.rows,
         open_vertices=boundary_vertices(js.refine(scheme, topology, controls[0])),
         tolerance=jnp.asarray(tolerance, dtype),
     )
@@ -233,9 +234,9 @@ def _strength(problem: Problem, priors: Priors, pilot: FitResult | None) -> Foun
         return found
     told = pilot._problem.found()
     if priors.bend is None:
-        found = found._replace(bend_precision=told.bend_precision, likeness=told.likeness)
-        if not len(told.expected.rows):  # the pilot expected no heights, and knows no strength of them
-            found = found._replace(expected=told.expected)
+        found = found._replace(bend_precision=told.bend_precision, expected=found.expected.only(told.expected))
+        if priors.likeness is None:
+            found = found._replace(likeness=told.likeness)
     return found._replace(determined=told.determined)
 
 
@@ -336,8 +337,9 @@ def _sweep(common: _Common, subject: _Subject, expected: Expected, state: _State
 
     stiff = STIFFER / jnp.mean(bend_asymmetry(topology, surface, common.bend_edges) ** 2)
     stiffest = jnp.where(k > 0, state.stiff, stiff)
-    least = stiffest * SOFTER ** k.astype(edge.dtype)
-    bend, height = jnp.maximum(common.bend, least), jnp.maximum(common.height, least)
+    softer = SOFTER ** k.astype(edge.dtype)
+    bend = jnp.maximum(common.bend, stiffest * softer)
+    height = jnp.maximum(common.height, STIFFER / jnp.mean(expected.heights**2) * softer)
     moved = surface_moved(js.RefinedSurface(*state.before, topology.faces), surface)
     change = jnp.abs(seen.robust_rms - state.robust_rms[jnp.maximum(k - 1, 0)])
     counted = jnp.maximum(jnp.sum(seen.weights > 0), 1).astype(edge.dtype)

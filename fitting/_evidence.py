@@ -4,7 +4,7 @@ probable, place by place.
 The strength of a Gaussian prior under which data are most probable obeys a fixed point: the bends that are left, over
 their variance, equal the number of bends that the data do not determine. Source: D. MacKay, Bayesian interpolation,
 1992, eq. (4.7); as an update for any number of strengths at once, S. Wood and M. Fasiolo, A generalized Fellner-Schall
-method for smoothing parameter optimization, 2017, eq. (4). Here every control face has a strength of its own, shared
+method for smoothing parameter optimization, 2017, eq. (4). Here every control face has strengths of its own, shared
 with its neighbourhood as the mean of logarithms and, a little, with the whole surface: a skull is smoother than an ear.
 
 The prior's means are the template's bends times one number, the likeness. Under given strengths that is most probable
@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 import jaxsubdiv as js
 
@@ -41,44 +41,57 @@ def neighbourhoods(topology: js.Topology) -> sp.csr_array:
 
 
 def next_precision(
-    precision: Float[np.ndarray, "f"],
+    precision: Float[np.ndarray, "s"],
     bends: Float[np.ndarray, "b"],
     by: sp.csr_array,
-    face: Int[np.ndarray, "b"],
+    strength: Int[np.ndarray, "b"],
     solve_prior: Solve,
     solve_posterior: Solve,
     around: sp.csr_array,
-) -> Float[np.ndarray, "f"]:
+) -> Float[np.ndarray, "s"]:
     """One step of the fixed point.
 
     Args:
-        precision: 1 / variance of a bend, a control face, in 1/mm^2.
+        precision: 1 / variance of a row, a strength each, in 1/mm^2; families of strengths one after the other, each
+            with one for every control face.
         bends: in mm.
         by: their derivatives by the unknowns.
-        face: the control face of each bend.
+        strength: which is that of each row.
         solve_prior: with the normal matrix of all priors.
         solve_posterior: with that of the priors and the scan.
         around: see `neighbourhoods`.
     """
-    root = np.sqrt(precision)[face]
+    root = np.sqrt(precision)[strength]
     probes = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(bends), _PROBES))
     sides = by.T @ (probes * root[:, None])
     free = root * np.mean(probes * (by @ (solve_prior(sides) - solve_posterior(sides))), axis=1)
     n = len(precision)
-    determined = np.maximum(np.bincount(face, free, n), 0)
-    left = np.bincount(face, bends**2, n)
+    determined = np.maximum(np.bincount(strength, free, n), 0)
+    left, rows = np.bincount(strength, bends**2, n), np.bincount(strength, minlength=n)
+    families = np.arange(n).reshape(-1, len(around.indptr) - 1)
+    return np.concatenate([_of_family(precision[f], determined[f], left[f], rows[f] > 0, around) for f in families])
+
+
+def _of_family(
+    precision: Float[np.ndarray, "f"],
+    determined: Float[np.ndarray, "f"],
+    left: Float[np.ndarray, "f"],
+    has_rows: Bool[np.ndarray, "f"],
+    around: sp.csr_array,
+) -> Float[np.ndarray, "f"]:
+    """Next strengths, from how many rows the data determine on each face, and the squares that are left of all."""
+    if determined.sum() < 1:  # rows in holes alone: nothing is known of them
+        return precision
     # Where the scan says nothing, in a hole, the surface is as smooth as elsewhere.
-    shared = _SHARE_OF_ALL * determined.mean()
-    usual = np.exp(np.average(np.log(precision), weights=determined + shared + _TINY))
+    shared = _SHARE_OF_ALL * determined.sum() / max(has_rows.sum(), 1)
+    usual = np.exp(np.average(np.log(precision), weights=determined + (shared + _TINY) * has_rows + _TINY))
     found = (shared + determined) / np.maximum(shared / usual + left, _TINY)
     changed = precision * np.clip(found / precision, 1 / _LARGEST_CHANGE, _LARGEST_CHANGE)
     # Means of the logarithms: means of the bends would be those of the one ear or rim in a neighbourhood, and leave
-    # noise in all of it.
-    has_bends = np.bincount(face, minlength=n) > 0  # edges that are not halved belong to one face of two
-    votes = around @ has_bends
-    return np.exp(
-        np.where(votes > 0, around @ (np.log(changed) * has_bends), np.log(changed)) / np.where(votes > 0, votes, 1)
-    )
+    # noise in all of it. Edges that are not halved belong to one face of two, and the other has no rows.
+    votes = around @ has_rows
+    means = around @ (np.log(changed) * has_rows) / np.where(votes > 0, votes, 1)
+    return np.where(votes > 0, np.exp(means), precision)
 
 
 def next_likeness(

@@ -21,7 +21,7 @@ from ._correspondence import nearest_rows
 from ._fit import check, fit
 from ._landmarks import Landmarks
 from ._recipe import Recipe
-from ._residuals import Priors, splits_in_four
+from ._residuals import Priors, control_faces_of, splits_in_four
 from ._result import FitResult
 from ._scan import Scan
 from ._symmetry import Symmetry, find_symmetry
@@ -55,7 +55,7 @@ class _Start(NamedTuple):
     scheme: js.AbstractScheme
     alignment: Alignment | None
     splits: int
-    bare: Bool[np.ndarray, "f"] | None = None
+    unseen: Bool[np.ndarray, "f"] | None = None
     """Control faces without scan points, of a mesh that was split; None before."""
 
 
@@ -89,7 +89,8 @@ def fit_scan(
         landmarks: places on scan and template, for the alignment and the fit; see `Landmarks`.
         tolerance_mm: split the control mesh by the scheme's own rule, and fit again, until the misfit (see `misfit`) is
             this small, or too small to be told from the noise, or the next split would make too many faces for
-            `most_faces` or for two points a control vertex.
+            `most_faces` or for two points a control vertex. Where a split mesh has no scan points it is expected to
+            stay as it was, whatever the priors say of likeness.
         most_faces: of the control mesh, where it is split.
         most_points: fit no more than so many of the points, drawn at random, and measure them all then. Default: all.
         on_stage: told what begins, in a few words.
@@ -151,16 +152,16 @@ def fit_scan(
         if partners is None and mesh is not None and np.isfinite(priors.symmetry):
             partners = _partners(mesh, first, start.splits)
         here = {"landmarks": of_first, "symmetry": partners, "checkpoint": checkpoint}
-        if start.bare is not None:
+        if start.unseen is not None:
             # Holes stay as they were filled; elsewhere the noise of the scan, which is in the fit now, is not expected.
-            here |= {"alike": start.bare, "priors": dataclasses.replace(priors, likeness=1.0)}
+            here |= {"alike": start.unseen, "priors": dataclasses.replace(priors, likeness=1.0)}
         result = fit(start.scheme, topology, control, scan, **(options | here))
         outcome = _outcome(result, start.mesh, tolerance_mm, most_faces)
         if tolerance_mm is None or outcome is not None:
             break
         finer = _split(result.scheme, start.mesh, result.control)
-        bare = np.repeat(~_has_points(result), 4) if splits_in_four(topology) else np.zeros(finer.n_faces, bool)
-        start = _Start(finer, result.scheme, start.alignment, start.splits + 1, bare)
+        unseen = np.repeat(~_has_points(result), 4) if splits_in_four(topology) else np.zeros(finer.n_faces, bool)
+        start = _Start(finer, result.scheme, start.alignment, start.splits + 1, unseen)
     if kept is not None:
         kept.remove()
     if scan is not whole:
@@ -173,7 +174,8 @@ def fit_scan(
 
 def _has_points(result: FitResult) -> Bool[np.ndarray, "f"]:
     """Control faces that the scan has points on."""
-    owner, counted = result._problem.owner, result.inliers & (result.weights > 0)
+    topology, counted = result._problem.topology, result.inliers & (result.weights > 0)
+    owner = control_faces_of(topology, result.surface, result.control)
     return np.bincount(owner[np.asarray(result.at.face)[counted]], minlength=owner.max() + 1) > 0
 
 
@@ -194,7 +196,7 @@ def _arrays(start: _Start) -> dict[str, Any]:
     """A start as a checkpoint keeps it; the mesh of the alignment follows from the rest."""
     mesh, alignment = start.mesh, start.alignment
     arrays = {"vertices": mesh.vertices, "triangles": mesh.faces[3], "quads": mesh.faces[4], "normals": mesh.normals}
-    arrays |= {"h": start.scheme.h, "splits": start.splits, "bare": start.bare}
+    arrays |= {"h": start.scheme.h, "splits": start.splits, "unseen": start.unseen}
     return arrays if alignment is None else arrays | alignment._replace(mesh=None)._asdict()
 
 
@@ -208,7 +210,7 @@ def _recalled(arrays: dict[str, np.ndarray], scheme: js.AbstractScheme, template
     if template is not None and "transform" in arrays:
         numbers = float(arrays["rms"]), float(arrays["share"]), tuple(map(str, arrays["doubts"]))
         alignment = Alignment(arrays["transform"], put(template, arrays["transform"]), *numbers)
-    return _Start(mesh, scheme, alignment, int(arrays["splits"]), arrays.get("bare"))
+    return _Start(mesh, scheme, alignment, int(arrays["splits"]), arrays.get("unseen"))
 
 
 def misfit(result: FitResult) -> float:
@@ -216,6 +218,7 @@ def misfit(result: FitResult) -> float:
 
     Noise differs from point to point; what neighbouring points have in common is the surface's own error, or noise that
     they share. The square of this is the mean product of the signed distances of each inlier and the one next to it.
+    `Uncertainty.misfit` has it place by place, and adds what the fit took of the noise.
     """
     inliers = result.inliers
     points, distances = result.points[inliers], result.distances[inliers]

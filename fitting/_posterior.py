@@ -76,8 +76,11 @@ class Posterior:
         finer = range(len(self.problem.topology.levels) - 1, -1, -1) if splits_in_four(self.problem.topology) else []
         patches = [owner[face]] + [face // 4**level for level in finer]
         of_faces = misfit_variances(distances, weights, at_points, patches, self.problem.around)
-        counts = np.bincount(corners.ravel(), minlength=len(variances))
-        return np.bincount(corners.ravel(), np.repeat(of_faces[owner], 4), len(variances)) / np.maximum(counts, 1)
+        once = np.append(np.ones((len(corners), 3)), corners[:, 3:] != corners[:, 2:3], axis=1)  # triangles repeat one
+        sums, counts = (
+            np.bincount(corners.ravel(), (once * of).ravel(), len(variances)) for of in (of_faces[owner][:, None], 1)
+        )
+        return sums / np.maximum(counts, 1)
 
     def _variances(self) -> Callable[[Int[np.ndarray, "m d"], Float[np.ndarray, "m d"]], Float[np.ndarray, "m"]]:
         """Variances of sums of unknowns, given by their columns and factors."""

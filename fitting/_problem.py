@@ -78,7 +78,7 @@ class _Equations(NamedTuple):
     """Of the priors' matrix."""
     gradient: Float[np.ndarray, "n"]
     bends: Float[np.ndarray, "b"]
-    """And their heights."""
+    """And their heights, less what is expected of both."""
     by_bend: Float[np.ndarray, "b d"]
     ties: Ties | None
     """Of the prior of symmetry, whose rows lie in no control face."""
@@ -151,9 +151,9 @@ class Problem:
         self._bends = np.asarray(bend_asymmetry(topology, own, self._bend_edges), np.float64)
         heights = np.asarray(bend_height(own, self._bend_edges), np.float64)
         there = np.ones(len(heights), bool) if alike is None else alike[self._faces.bend]
-        if priors.bend is not None or (priors.likeness is not None and priors.likeness == 0):
-            there[:] = False
-        self._expect(Expected(np.where(there, self._bends, 0.0), np.flatnonzero(there), heights[there]))
+        there &= priors.bend is None if priors.likeness is None else bool(priors.likeness > 0)
+        rows = np.flatnonzero(there & (priors.bend is None))  # nothing says how closely heights should be kept, else
+        self._expect(Expected(np.where(there, self._bends, 0.0), rows, heights[rows]))
         self.around = neighbourhoods(topology)
         self._folds = Folds(topology)
         self._edge = float(edge_length(topology, control.vertices))
@@ -211,8 +211,9 @@ class Problem:
         data, gradient, border = self._of_distances(found, seen, shifts)
         rows, by_priors = jax.tree.map(lambda values: np.asarray(values, np.float64), (found.rows, found.by_rows))
         if not len(self._precision):
-            first = 1 / max(float(np.mean(np.square(self._bends))) / STIFFER, _TINY)
-            self._set_bend(np.full((2 if len(self._expected.rows) else 1) * self._n_faces, first))
+            families = [self._bends] + ([self._expected.heights] if len(self._expected.rows) else [])
+            first = [STIFFER / max(float(np.mean(np.square(of))), _TINY) for of in families]
+            self._set_bend(np.repeat(first, self._n_faces))
         weights, of_priors = np.concatenate(self.prior_precisions()), self._row_faces(start)
         gradient += times_transposed(elements, by_priors, weights * np.concatenate(rows[1:]), of_priors)
         prior = normal_matrix(elements, by_priors, weights, of_priors)
@@ -319,9 +320,9 @@ class Problem:
             expected = larger(self._template, moved) * self._expected.bends
             self.likeness = next_likeness(likeness, expected, before[faces.bend], bends[:n], by[:n], solve)
         of_priors = factorise(self._matrix(found.prior, self.loose, found.tied)).solve
-        around = sp.csr_array(sp.block_diag([self.around] * (len(before) // self._n_faces)))
-        self._set_bend(next_precision(before, bends, by, strength, of_priors, solve, around))
-        settled = np.abs(np.log(self._precision / before)).mean() < _SETTLED
+        self._set_bend(next_precision(before, bends, by, strength, of_priors, solve, self.around))
+        used = np.bincount(strength, minlength=len(before)) > 0
+        settled = np.abs(np.log(self._precision / before))[used].mean() < _SETTLED
         self.annealed = bool(settled and abs(self.likeness - likeness) < _SETTLED_LIKENESS)
 
     def _count_determined(self, found: _Equations, factor: SuperLU) -> None:
@@ -433,6 +434,11 @@ class Problem:
         """The structure, known after the first sweep."""
         assert self._elements is not None
         return self._elements
+
+    @property
+    def likeness_of_all(self) -> float:
+        """The likeness, as a mean over all bends: those of a mesh that was split are mostly not expected."""
+        return self.likeness * float(np.mean(self._expected.bends != 0))
 
     @property
     def owner(self) -> Int[np.ndarray, "g"]:

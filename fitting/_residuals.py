@@ -59,7 +59,8 @@ class Priors(eqx.Module):
             by place: holes of the scan are filled as the control mesh is shaped. None, the default: the likeness that
             makes the scan most probable, about 0.9 where the control mesh is the same anatomy of another person and
             about 0 where its details say nothing of the scan's; and 0 where `bend` is given. Give 0 where the control
-            mesh was made from this very scan or fitted to it before, for its noise would be expected again.
+            mesh was made from this very scan or fitted to it before, for its noise would be expected again. With `bend`
+            given, nothing is expected of curvature.
         shift: of how far breathing displaced a slice of the scan, in mm, along each of two axes of the slice's plane.
 
     Raises:
@@ -109,6 +110,11 @@ class Expected(NamedTuple):
     rows: Int[Array | np.ndarray, "g"]
     """The bends whose heights are expected."""
     heights: Float[Array | np.ndarray, "g"]
+
+    def only(self, other: "Expected") -> "Expected":
+        """No more than what the other one says something of."""
+        rows, mine, _ = np.intersect1d(self.rows, other.rows, return_indices=True)
+        return Expected(np.where(np.asarray(other.bends) != 0, self.bends, 0.0), rows, np.asarray(self.heights)[mine])
 
     def times(self, bends: Any, heights: Any) -> "Expected":
         """With factors of the bends and of the heights."""

@@ -41,8 +41,8 @@ class FitResult:
         noise: standard deviation in mm of the Gaussian part of the distances: the noise of the scan, and the detail
             that the control mesh is too coarse for.
         result: `optimistix.RESULTS.successful`, or why the fit stopped without having converged.
-        likeness: how much of the shape where the fit started, or of its template, was expected of the surface; see
-            `Priors.likeness`.
+        likeness: how much of the shape where the fit started was expected of the surface, see `Priors.likeness`; of a
+            mesh that was split, as a mean over the surface.
         recipe: the settings that the fit was given, to fit the next scan in the same way.
         start: the control where the fit started, with the normals that it took.
         shifts: how far each slice of the scan was shifted, in mm; no row where none was free to move.
@@ -79,7 +79,7 @@ class FitResult:
         self.result = result
         self.recipe = recipe
         self.start = start
-        self.likeness = problem.likeness
+        self.likeness = problem.likeness_of_all
         self.shifts = np.zeros((0, 3)) if shifts is None else shifts.vectors
         self.slices = np.zeros(0, int) if shifts is None else shifts.slices
         self._problem, self._seen, self._shifts = problem, seen, shifts
@@ -121,7 +121,8 @@ class FitResult:
         """The same surface, measured by another scan: by all points of the one of which a part was fitted, say.
 
         Correspondences, distances, noise, report and uncertainty are those of its points; the convergence is that of
-        the fit. Slices keep the shifts that the fit found for their numbers.
+        the fit. Slices keep the shifts that the fit found for their numbers. The misfit in the uncertainty is somewhat
+        too large where the points were not those of the fit.
 
         Raises:
             ValueError: the fit does not know its settings.

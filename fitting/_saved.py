@@ -25,7 +25,7 @@ from ._scan import Scan
 from ._shifts import find_shifts
 from ._symmetry import symmetry_of
 
-_VERSION = 1
+_VERSION = 2  # 1 had no likeness
 _FIT, _RECIPE = "fit.npz", "recipe.json"
 _ENDS = ("successful", "nonlinear_max_steps_reached", "nonlinear_divergence", "nonfinite")
 _A_POINT = ("face", "uv", "directions", "distances", "weights", "precisions")
@@ -116,7 +116,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         arrays = dict(file)
     version = int(arrays["version"])
     if version != _VERSION:
-        raise ValueError(f"a fit of version {version}, but this release reads version {_VERSION}. Update it.")
+        what = "Update it" if version > _VERSION else f"Fit the scan again, by its {_RECIPE}"
+        raise ValueError(f"a fit of version {version}, but this release reads version {_VERSION}. {what}.")
     n = len(arrays["scan_points"])
     for name in _A_POINT:
         if len(arrays[name]) != n:
