@@ -212,7 +212,7 @@ class Problem:
         rows, by_priors = jax.tree.map(lambda values: np.asarray(values, np.float64), (found.rows, found.by_rows))
         if not len(self._precision):
             families = [self._bends] + ([self._expected.heights] if len(self._expected.rows) else [])
-            first = [STIFFER / max(float(np.mean(np.square(of))), _TINY) for of in families]
+            first = [1 / max(float(np.mean(np.square(of))) / STIFFER, _TINY) for of in families]
             self._set_bend(np.repeat(first, self._n_faces))
         weights, of_priors = np.concatenate(self.prior_precisions()), self._row_faces(start)
         gradient += times_transposed(elements, by_priors, weights * np.concatenate(rows[1:]), of_priors)

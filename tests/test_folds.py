@@ -153,11 +153,11 @@ def scan_of_the_sheet() -> fitting.Scan:
     return fitting.Scan(js.sample(surface, 600, jax.random.key(0)).points)
 
 
-def fit_from(vertices: np.ndarray) -> fitting.FitResult:
+def fit_from(vertices: np.ndarray, **options) -> fitting.FitResult:
     mesh = with_three_neighbours()
     control = js.ControlMesh(vertices, mesh.faces).control()
     topology = js.build_topology(mesh, js.Interpolating(), 1)
-    return fitting.fit(js.Interpolating(), topology, control, scan_of_the_sheet(), throw=False)
+    return fitting.fit(js.Interpolating(), topology, control, scan_of_the_sheet(), throw=False, **options)
 
 
 def test_fit_from_a_face_upside_down_warns_and_finds_the_surface():
@@ -199,9 +199,10 @@ def test_step_that_turns_faces_over_is_taken_again_and_shorter(monkeypatch):
         return scheme, control
 
     monkeypatch.setattr(_fit, "_apply", watched)
-    fit_from(start)
+    rough = {"priors": fitting.Priors(likeness=0.0)}  # the noise of the start's shape is not to be expected
+    fit_from(start, **rough)
     with_care = max(turned)
     turned.clear()
     monkeypatch.setattr(_problem, "_TRIES", 1)
-    fit_from(start)
+    fit_from(start, **rough)
     assert with_care == 0 < max(turned)

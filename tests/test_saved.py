@@ -122,7 +122,8 @@ def changed(folder, **arrays) -> None:
 @pytest.mark.parametrize(
     ("arrays", "words"),
     [
-        ({"version": np.array(2)}, "version 2, but this release reads version 1"),
+        ({"version": np.array(3)}, "version 3, but this release reads version 2. Update it"),
+        ({"version": np.array(1)}, "version 1, but this release reads version 2. Fit the scan again, by its recipe"),
         ({"distances": None}, "'distances' is missing"),
         ({"h": None}, "'h' is missing"),
         ({"uv": np.zeros((5, 2))}, "'uv' has 5 rows for 600 scan points"),
