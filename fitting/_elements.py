@@ -350,10 +350,11 @@ def _pattern(columns: Int[np.ndarray, "f d"], n: int) -> tuple[sp.csc_array, lis
         face, entry = np.nonzero(row < n)
         keys = column[face, entry].astype(np.int64) * n + row[face, entry]
         order = np.argsort(keys, kind="stable")
-        keys_of_run, first = np.unique(keys[order], return_index=True)
+        keys = keys[order]
+        first = np.flatnonzero(np.diff(keys, prepend=-1))
         source = (face * d**2 + one[entry] * d + other[entry])[order]
-        keys_of_runs.append(keys_of_run)
-        runs.append(Run(slice(start, start + len(those)), source, first, keys_of_run))
+        keys_of_runs.append(keys[first])
+        runs.append(Run(slice(start, start + len(those)), source, first, keys[first]))
     keys = np.unique(np.concatenate(keys_of_runs))
     runs = [run._replace(place=np.searchsorted(keys, run.place)) for run in runs]
     column, row = keys // n, keys % n
