@@ -190,7 +190,7 @@ def fit_cohort(
         likeness=jnp.asarray(problem.likeness * (expected.bends != 0), dtype),
         determined=jnp.asarray(problem.determined, dtype),
         edges=control_edges(topology),
-        bend_edges=bend_edges(topology),
+        bend_edges=bend_edges(scheme, topology),
         height_rows=expected.rows,
         open_vertices=boundary_vertices(js.refine(scheme, topology, controls[0])),
         tolerance=jnp.asarray(tolerance, dtype),
@@ -228,8 +228,7 @@ def _strength(problem: Problem, priors: Priors, pilot: FitResult | None) -> Foun
     """Of the bend prior, and what it expects: as given, or as the pilot found it."""
     found = problem.found()
     if priors.bend is not None:
-        n_faces = sum(len(faces) for faces in problem.topology.control_faces.values())
-        found = found._replace(bend_precision=np.full(n_faces, float(priors.bend) ** -2))
+        found = found._replace(bend_precision=np.full(problem.topology.n_control_faces, float(priors.bend) ** -2))
     if pilot is None:
         return found
     told = pilot._problem.found()
@@ -294,7 +293,7 @@ def _expected(common: _Common, subject: _Subject) -> Expected:
     """Of bends, at the size of the start."""
     surface = _refined(common, common.scheme.h, subject.control)
     own, rows = with_control_vertices(common.topology, common.scheme, subject.control, surface), common.height_rows
-    bends = common.likeness * bend_asymmetry(common.topology, own, common.bend_edges)
+    bends = common.likeness * bend_asymmetry(own, common.bend_edges)
     return Expected(bends, rows, bend_height(own, jnp.asarray(common.bend_edges)[rows]))
 
 
@@ -335,7 +334,7 @@ def _sweep(common: _Common, subject: _Subject, expected: Expected, state: _State
     at = search_closest(surface, subject.scan.points)
     seen = measure(surface, subject.scan, at, common.open_vertices, subject.around, edge, floor, common.loss)
 
-    stiff = STIFFER / jnp.mean(bend_asymmetry(topology, surface, common.bend_edges) ** 2)
+    stiff = STIFFER / jnp.mean(bend_asymmetry(surface, common.bend_edges) ** 2)
     stiffest = jnp.where(k > 0, state.stiff, stiff)
     softer = SOFTER ** k.astype(edge.dtype)
     bend = jnp.maximum(common.bend, stiffest * softer)

@@ -125,8 +125,8 @@ def fit(
     # Made here and not in the signature: arrays made while a module loads would settle JAX's device and precision.
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
     symmetry = _partners(symmetry, priors, topology, control)
-    n_faces = sum(map(len, topology.control_faces.values()))
-    if alike is not None and alike.shape != (n_faces,):
+    if alike is not None and alike.shape != (topology.n_control_faces,):
+        n_faces = topology.n_control_faces
         raise ValueError(f"`alike` must say it of each of the {n_faces} control faces; got {list(alike.shape)}.")
     control = sound_start(scheme, topology, control, free)
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}

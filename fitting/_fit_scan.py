@@ -160,7 +160,9 @@ def fit_scan(
         if tolerance_mm is None or outcome is not None:
             break
         finer = _split(result.scheme, start.mesh, result.control)
-        unseen = np.repeat(~_has_points(result), 4) if splits_in_four(topology) else np.zeros(finer.n_faces, bool)
+        unseen = np.zeros(finer.n_faces, bool)
+        if splits_in_four(result.scheme, topology):
+            unseen = np.repeat(~_has_points(result), 4)
         start = _Start(finer, result.scheme, start.alignment, start.splits + 1, unseen)
     if kept is not None:
         kept.remove()
@@ -175,7 +177,7 @@ def fit_scan(
 def _has_points(result: FitResult) -> Bool[np.ndarray, "f"]:
     """Control faces that the scan has points on."""
     topology, counted = result._problem.topology, result.inliers & (result.weights > 0)
-    owner = control_faces_of(topology, result.surface, result.control)
+    owner = control_faces_of(result.scheme, topology, result.surface, result.control)
     return np.bincount(owner[np.asarray(result.at.face)[counted]], minlength=owner.max() + 1) > 0
 
 

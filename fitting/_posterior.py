@@ -73,7 +73,8 @@ class Posterior:
         at_points = np.sum(np.asarray(pairs.corner_weights, np.float64) * variances[np.asarray(pairs.corners)], axis=1)
         weights = np.asarray(seen.precisions, np.float64) * counted
         distances, face = np.asarray(seen.distances, np.float64), np.asarray(seen.at.face)
-        finer = range(len(self.problem.topology.levels) - 1, -1, -1) if splits_in_four(self.problem.topology) else []
+        nested = splits_in_four(self.scheme, self.problem.topology)
+        finer = range(len(self.problem.topology.levels) - 1, -1, -1) if nested else []
         patches = [owner[face]] + [face // 4**level for level in finer]
         of_faces = misfit_variances(distances, weights, at_points, patches, self.problem.around)
         once = np.append(np.ones((len(corners), 3)), corners[:, 3:] != corners[:, 2:3], axis=1)  # triangles repeat one

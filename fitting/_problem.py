@@ -56,7 +56,7 @@ from ._symmetry import Mirror, Symmetry, Ties, mirror_at, ties
 # vertex that turns back is held faster, and one that goes on is let go again: where the surface cannot follow the scan
 # (an ear in a coarse mesh) points change sides from sweep to sweep, and exact steps would go to and fro for ever.
 STEP, HOLD, LET_GO, FASTEST = 0.25, 8.0, 0.7, 1e6
-_TRIES = 6  # of a step that turns faces upside down: their vertices are held faster each time
+_HOLDS = HOLD, FASTEST  # one after the other, of the vertices of faces that a step turns upside down
 STIFFER = 10.0  # the bend prior's strength in the first sweep, over that of the template's own bends
 SOFTER = 0.3  # factor of the bend prior from sweep to sweep, down to its own strength
 _SETTLED = 0.3  # mean change of the logarithm of the bend prior's strength in a sweep
@@ -142,13 +142,13 @@ class Problem:
         self.is_free = flat(masks).astype(bool)
         # A surface of any shape: only to tell which face lies where.
         surface = js.refine(scheme, topology, control)
-        owner = control_faces_of(topology, surface, control)
-        self._n_faces = sum(map(len, topology.control_faces.values()))
+        owner = control_faces_of(scheme, topology, surface, control)
+        self._n_faces = topology.n_control_faces
         self._patches = find_patches(surface, owner, self._n_faces)
         self._faces = prior_faces(scheme, topology, anchors, owner, 0 if masks.h is None else masks.h.size)
-        self._edges, self._bend_edges = control_edges(topology), bend_edges(topology)
+        self._edges, self._bend_edges = control_edges(topology), bend_edges(scheme, topology)
         own = with_control_vertices(topology, scheme, control, surface)
-        self._bends = np.asarray(bend_asymmetry(topology, own, self._bend_edges), np.float64)
+        self._bends = np.asarray(bend_asymmetry(own, self._bend_edges), np.float64)
         heights = np.asarray(bend_height(own, self._bend_edges), np.float64)
         there = np.ones(len(heights), bool) if alike is None else alike[self._faces.bend]
         there &= priors.bend is None if priors.likeness is None else bool(priors.likeness > 0)
@@ -174,15 +174,15 @@ class Problem:
         It also finds the next strength of the bend prior.
         """
         found = self._equations(scheme, control, seen, shifts)
-        hold, tries = self._hold, 0
-        while True:
+        hold, rash = self._hold, np.zeros(len(self._template), bool)
+        for faster in (1.0, *_HOLDS):
+            hold = self._held(hold, np.where(rash, faster, 1.0))  # for this sweep alone
             held = factorise(self._whole(found, hold, 0.0 if shifts is None else np.repeat(shifts.hold, 2)))
             step, of_shifts = self._solution(found, held)
             offset = to_unknowns(jnp.asarray(step), self._zero)
-            rash, tries = self._rash(control, offset), tries + 1
-            if tries == _TRIES or not rash.any():
+            rash = self._rash(control, offset)
+            if not rash.any():
                 break
-            hold = self._held(hold, np.where(rash, HOLD, 1.0))  # for this sweep alone
         if shifts is not None:
             shifts = self._hold_what_shifts_back(shifts, of_shifts.reshape(-1, 2))
         # What is held says nothing of what the scan determines.

@@ -175,7 +175,7 @@ def surface_and_priors(offset: Unknowns, start: Start) -> tuple[Float[Array, "v 
     surface = js.refine(scheme, start.topology, control)
     dtype = surface.vertices.dtype
     none, own = jnp.zeros((0,), dtype), with_control_vertices(start.topology, scheme, control, surface)
-    bends, heights = bend_asymmetry(start.topology, own, start.bend_edges), none
+    bends, heights = bend_asymmetry(own, start.bend_edges), none
     if start.expected is not None:
         bends = bends - start.expected.bends
         heights = bend_height(own, jnp.asarray(start.bend_edges)[start.expected.rows]) - start.expected.heights
@@ -191,21 +191,14 @@ def surface_and_priors(offset: Unknowns, start: Start) -> tuple[Float[Array, "v 
     )
 
 
-def bend_asymmetry(
-    topology: js.Topology, surface: js.RefinedSurface, edges: Int[Array | np.ndarray, "b 2"] | None = None
-) -> Float[Array, "b"]:
+def bend_asymmetry(surface: js.RefinedSurface, edges: Int[Array | np.ndarray, "b 2"]) -> Float[Array, "b"]:
     """By how much the surface bends more at one end of an edge than at the other, in mm, edge by edge.
 
     It is half of the height of each end over the tangent plane at the other, one less the other:
     (n_a + n_b) . (x_b - x_a) / 2. It vanishes on spheres, on cylinders and for every circular arc, so that it smooths
     without shrinking; and it ties normals to the geometry, for a normal that leans bends its edges unevenly.
-
-    Args:
-        topology: tables of the surface.
-        surface: the surface, or a coarser mesh.
-        edges: default: those of the first level, or the control edges where there is one level only.
     """
-    a, b = jnp.asarray(bend_edges(topology) if edges is None else edges).T
+    a, b = jnp.asarray(edges).T
     return 0.5 * _along(surface, a, b, take(surface.normals, a) + take(surface.normals, b))
 
 
@@ -224,9 +217,9 @@ def _along(
     return dot(vectors, take(surface.vertices, b) - take(surface.vertices, a))[:, 0]
 
 
-def bend_edges(topology: js.Topology) -> Int[Array | np.ndarray, "b 2"]:
-    """The edges whose bends are compared."""
-    if len(topology.levels) == 1 or not splits_in_four(topology):
+def bend_edges(scheme: js.AbstractScheme, topology: js.Topology) -> Int[Array | np.ndarray, "b 2"]:
+    """The edges whose bends are compared: those of the first level, or the control edges where there is one alone."""
+    if len(topology.levels) == 1 or not splits_in_four(scheme, topology):
         return control_edges(topology)
     return topology.levels[1].edges
 
@@ -236,10 +229,11 @@ def control_edges(topology: js.Topology) -> Int[np.ndarray, "e 2"]:
     return _sides(topology).edges
 
 
-def splits_in_four(topology: js.Topology) -> bool:
+def splits_in_four(scheme: js.AbstractScheme, topology: js.Topology) -> bool:
     """Whether the descendants of a control face are the rows that the paper's split gives them."""
-    n = 4 ** len(topology.levels)
-    return all(len(topology.faces[size]) == n * len(faces) for size, faces in topology.control_faces.items())
+    n, faces = 4 ** len(topology.levels), topology.faces
+    four = all(len(faces[size]) == n * len(of_control) for size, of_control in topology.control_faces.items())
+    return four and scheme.is_primal  # a dual scheme's torus of quads has as many faces
 
 
 def with_control_vertices(
@@ -307,7 +301,7 @@ def prior_faces(
     of_edge = np.zeros(len(sides.edges), int)
     of_edge[sides.edge] = sides.face  # either of two will do
     bends = of_edge
-    if len(bend_edges(topology)) != len(of_edge):
+    if len(bend_edges(scheme, topology)) != len(of_edge):
         # As `build_topology` lays them out: halves of the control edges, three in a triangle, four in a quad.
         bends = np.concatenate([np.repeat(of_edge, 2), sides.face])
     corners = [np.tile(np.arange(len(triangles)), 3), np.tile(len(triangles) + np.arange(len(quads)), 4)]
@@ -323,10 +317,12 @@ def prior_faces(
     )
 
 
-def control_faces_of(topology: js.Topology, surface: js.RefinedSurface, control: js.Control) -> Int[np.ndarray, "g"]:
+def control_faces_of(
+    scheme: js.AbstractScheme, topology: js.Topology, surface: js.RefinedSurface, control: js.Control
+) -> Int[np.ndarray, "g"]:
     """The control face that every face of the surface descends from; where the split keeps no order, the nearest."""
     triangles, quads = (len(topology.control_faces[size]) for size in (3, 4))
-    if splits_in_four(topology):
+    if splits_in_four(scheme, topology):
         return np.arange((triangles + quads) * 4 ** len(topology.levels)) // 4 ** len(topology.levels)
 
     def centres(vertices: Array, faces: dict) -> Float[np.ndarray, "f 3"]:

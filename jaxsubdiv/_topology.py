@@ -100,6 +100,11 @@ class Topology(eqx.Module):
         return self.control_fans.order.shape[0]
 
     @property
+    def n_control_faces(self) -> int:
+        """Number of control faces."""
+        return sum(len(faces) for faces in self.control_faces.values())
+
+    @property
     def has_seams(self) -> bool:
         """Whether boundary edges are sewn together at some level."""
         return any(isinstance(level, Level) and level.seams is not None for level in self.levels)

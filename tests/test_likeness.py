@@ -138,8 +138,8 @@ def test_likeness_is_a_share_of_the_bends_at_the_start():
     nothing = expected(Priors(likeness=0.0), template)
     assert not np.any(nothing.bends) and not len(nothing.rows)
     whole, half = (expected(Priors(likeness=share), template) for share in (1.0, 0.5))
-    surface, edges = js.refine(SCHEME, anatomy().topology, template), bend_edges(anatomy().topology)
-    np.testing.assert_allclose(whole.bends, bend_asymmetry(anatomy().topology, surface), atol=1e-5)
+    surface, edges = js.refine(SCHEME, anatomy().topology, template), bend_edges(SCHEME, anatomy().topology)
+    np.testing.assert_allclose(whole.bends, bend_asymmetry(surface, edges), atol=1e-5)
     np.testing.assert_allclose(half.bends, 0.5 * np.asarray(whole.bends), rtol=1e-5)
     assert np.abs(whole.bends).max() > 0.1
     for share in (whole, half):

@@ -50,10 +50,10 @@ def mixed_rows(kind: str, levels: int):
     corners, weights = js._surface.corner_weights(surface, at)
     directions = js.evaluate(surface, at).normals
     pairs = Pairs(js.evaluate(surface, at).points + 0.1 * directions, corners, weights, directions)
-    edges = control_edges(topology), bend_edges(topology)
+    edges = control_edges(topology), bend_edges(scheme, topology)
     start = Start(scheme, topology, control, jnp.asarray(mesh.vertices), None, *edges)
     zero = no_offset(free, scheme, control)
-    owner = control_faces_of(topology, surface, control)
+    owner = control_faces_of(scheme, topology, surface, control)
     faces = prior_faces(scheme, topology, None, owner, zero.h.size)
     patches = find_patches(surface, owner, mesh.n_faces)
 
@@ -180,7 +180,7 @@ def to_truth(result: fitting.FitResult) -> float:
 
 
 def roughness(result: fitting.FitResult) -> float:
-    bends = fitting._residuals.bend_asymmetry(problem().topology, result.surface)
+    bends = fitting._residuals.bend_asymmetry(result.surface, bend_edges(result.scheme, problem().topology))
     return float(np.sqrt(np.mean(bends**2)))
 
 

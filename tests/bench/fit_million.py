@@ -32,19 +32,20 @@ def ring(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--points", type=int, default=1_000_000)
+    parser.add_argument("--most-points", type=int, help="fit so many of them, and measure all (default: fit all)")
     given = parser.parse_args()
     rng = np.random.default_rng(0)
     points = ring(*rng.uniform(0, 2 * np.pi, (2, given.points))) + rng.normal(scale=SIGMA, size=(given.points, 3))
     start, faces = meshes.torus(64, 48, "triangle")
     angles = np.arctan2(start[:, 1], start[:, 0]), np.arctan2(start[:, 2], np.hypot(*start[:, :2].T) - 2)
     mesh = js.ControlMesh(ring(*angles) + rng.normal(scale=1.0, size=start.shape), faces)
-    topology = js.build_topology(mesh, js.Interpolating(), 2)
     began = time.perf_counter()
 
     def told(sweep: fitting.Sweep) -> None:
         print(f"sweep {sweep.number}: {sweep.rms:.3f} mm, {time.perf_counter() - began:.1f} s", flush=True)
 
-    found = fitting.fit(js.Interpolating(), topology, mesh.control(), fitting.Scan(points), throw=False, on_sweep=told)
+    options = {"pose": None, "levels": 2, "most_points": given.most_points}
+    found = fitting.fit_scan(fitting.Scan(points), mesh, **options, throw=False, on_sweep=told).result
     truth = ring(*rng.uniform(0, 2 * np.pi, (2, 50_000)))
     off = js.evaluate(found.surface, fitting.closest_points(found.surface, truth)).points - truth
     print(f"{given.points:,} points, {len(mesh.vertices):,} control vertices, {found.report().n_unknowns:,} unknowns")
