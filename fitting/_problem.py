@@ -56,7 +56,7 @@ from ._symmetry import Mirror, Symmetry, Ties, mirror_at, ties
 # vertex that turns back is held faster, and one that goes on is let go again: where the surface cannot follow the scan
 # (an ear in a coarse mesh) points change sides from sweep to sweep, and exact steps would go to and fro for ever.
 STEP, HOLD, LET_GO, FASTEST = 0.25, 8.0, 0.7, 1e6
-_HOLDS = HOLD, FASTEST  # one after the other, of the vertices of faces that a step turns upside down
+_TRIES = 6  # of a step that turns faces upside down: their vertices are held faster each time
 STIFFER = 10.0  # the bend prior's strength in the first sweep, over that of the template's own bends
 SOFTER = 0.3  # factor of the bend prior from sweep to sweep, down to its own strength
 _SETTLED = 0.3  # mean change of the logarithm of the bend prior's strength in a sweep
@@ -175,8 +175,8 @@ class Problem:
         """
         found = self._equations(scheme, control, seen, shifts)
         hold, rash = self._hold, np.zeros(len(self._template), bool)
-        for faster in (1.0, *_HOLDS):
-            hold = self._held(hold, np.where(rash, faster, 1.0))  # for this sweep alone
+        for _ in range(_TRIES):
+            hold = self._held(hold, np.where(rash, HOLD, 1.0))  # for this sweep alone
             held = factorise(self._whole(found, hold, 0.0 if shifts is None else np.repeat(shifts.hold, 2)))
             step, of_shifts = self._solution(found, held)
             offset = to_unknowns(jnp.asarray(step), self._zero)
