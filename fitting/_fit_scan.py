@@ -20,6 +20,7 @@ from ._control_mesh import FaceKind, control_mesh
 from ._correspondence import nearest_rows
 from ._fit import check, fit
 from ._landmarks import Landmarks
+from ._memory import memory_of_fit
 from ._recipe import Recipe
 from ._residuals import Priors, control_faces_of, splits_in_four
 from ._result import FitResult
@@ -136,10 +137,11 @@ def fit_scan(
         start = _Start(mesh, first, None, 0)
     own_partners = options.pop("symmetry", None)
     while True:
-        say(f"fits {len(start.mesh.vertices):,} control vertices")
         # Tables come from the faces alone; normals that would fold the surface are replaced in the fit.
         bare = js.ControlMesh(start.mesh.vertices, start.mesh.faces)
         topology = js.build_topology(bare, start.scheme, levels, **of_tables)
+        memory = memory_of_fit(topology, scan.n_points) / 1e9
+        say(f"fits {len(start.mesh.vertices):,} control vertices, in about {memory:.1f} GB of memory")
         control = start.mesh.control(weights=first.weights)
         if start.splits == 0 and not first.interpolates:
             control = js.Control(_swollen(start.mesh, first), control.normals)

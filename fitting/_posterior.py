@@ -20,7 +20,7 @@ from ._problem import Problem, factorise
 from ._residuals import splits_in_four
 from ._shifts import Shifts
 
-_DENSE = 4000  # unknowns whose covariance is kept whole, in 130 MB
+DENSE = 4000  # unknowns whose covariance is kept whole, in 130 MB
 _DRAWS = 200
 _ROWS_AT_ONCE = 1024
 
@@ -87,7 +87,7 @@ class Posterior:
         """Variances of sums of unknowns, given by their columns and factors."""
         n, free = self.problem.elements.n, np.append(self.problem.is_free, False)  # one more, which nothing moves
         covariance = draws = np.zeros((n + 1, 0))
-        exact = free.sum() <= _DENSE
+        exact = free.sum() <= DENSE
         if exact:
             covariance = np.zeros((n + 1, n + 1))
             covariance[np.ix_(free, free)] = np.linalg.inv(self.matrix.toarray())[: self.n_free, : self.n_free]

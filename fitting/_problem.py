@@ -174,15 +174,15 @@ class Problem:
         It also finds the next strength of the bend prior.
         """
         found = self._equations(scheme, control, seen, shifts)
-        hold, rash = self._hold, np.zeros(len(self._template), bool)
-        for _ in range(_TRIES):
-            hold = self._held(hold, np.where(rash, HOLD, 1.0))  # for this sweep alone
+        hold, tries = self._hold, 0
+        while True:
             held = factorise(self._whole(found, hold, 0.0 if shifts is None else np.repeat(shifts.hold, 2)))
             step, of_shifts = self._solution(found, held)
             offset = to_unknowns(jnp.asarray(step), self._zero)
-            rash = self._rash(control, offset)
-            if not rash.any():
+            rash, tries = self._rash(control, offset), tries + 1
+            if tries == _TRIES or not rash.any():
                 break
+            hold = self._held(hold, np.where(rash, HOLD, 1.0))  # for this sweep alone
         if shifts is not None:
             shifts = self._hold_what_shifts_back(shifts, of_shifts.reshape(-1, 2))
         # What is held says nothing of what the scan determines.

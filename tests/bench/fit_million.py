@@ -29,16 +29,23 @@ def ring(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.stack([around * np.cos(u), around * np.sin(u), tube * np.sin(v)], axis=-1)
 
 
+def problem(
+    rng: np.random.Generator, n_points: int, vertices: tuple[int, int], rough: float
+) -> tuple[js.ControlMesh, np.ndarray]:
+    """Control mesh, with noise of `rough` mm, and noisy points; vertices around the ring and around its tube."""
+    points = ring(*rng.uniform(0, 2 * np.pi, (2, n_points))) + rng.normal(scale=SIGMA, size=(n_points, 3))
+    start, faces = meshes.torus(*vertices, "triangle")
+    angles = np.arctan2(start[:, 1], start[:, 0]), np.arctan2(start[:, 2], np.hypot(*start[:, :2].T) - 2)
+    return js.ControlMesh(ring(*angles) + rng.normal(scale=rough, size=start.shape), faces), points
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--points", type=int, default=1_000_000)
     parser.add_argument("--most-points", type=int, help="fit so many of them, and measure all (default: fit all)")
     given = parser.parse_args()
     rng = np.random.default_rng(0)
-    points = ring(*rng.uniform(0, 2 * np.pi, (2, given.points))) + rng.normal(scale=SIGMA, size=(given.points, 3))
-    start, faces = meshes.torus(64, 48, "triangle")
-    angles = np.arctan2(start[:, 1], start[:, 0]), np.arctan2(start[:, 2], np.hypot(*start[:, :2].T) - 2)
-    mesh = js.ControlMesh(ring(*angles) + rng.normal(scale=1.0, size=start.shape), faces)
+    mesh, points = problem(rng, given.points, (64, 48), rough=1.0)
     began = time.perf_counter()
 
     def told(sweep: fitting.Sweep) -> None:
