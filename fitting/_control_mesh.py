@@ -32,6 +32,7 @@ _NEIGHBOUR = 10  # the one whose distance tells the density
 _COARSE_CELLS = 50
 _TURNS = 6
 _SMOOTHER = (1.0, 1.5, 2.5)
+_SLICES_APART = 4.0  # times the spacing of the points in them: ten neighbours lie on one contour
 # A point is dropped where it lies thinly and its neighbours make no plane: sparse but smooth parts stay.
 _THIN, _THICK = 1.7, 0.15
 _FAR_OFF = 5.0  # robust standard deviations from the surface
@@ -87,8 +88,8 @@ def control_mesh(
             large that its unit is hardly mm.
 
     Raises:
-        ScanError: fewer than 50 points, all on a line or a plane, or no surface in them; faces too few for the
-            topology.
+        ScanError: fewer than 50 points, all on a line or a plane, or no surface in them; contours in slices that lie
+            far apart; faces too few for the topology.
         ImportError: the extra `mesh` is missing.
 
     Source: Kazhdan 2006 (Poisson), Hoppe 1992 and Hou 2022 (normals), Valette 2004 (clusters).
@@ -98,6 +99,7 @@ def control_mesh(
     if faces < _LEAST_FACES:
         raise ValueError(f"`faces` must be {_LEAST_FACES} or more; got {faces}.")
     _need_extra()
+    _check_slices(scan)
     cloud = _cleaned(scan)
     _warn_of_unit(float(np.linalg.norm(np.ptp(cloud.points, axis=0))))
     cloud, dense, topology = _simplest(cloud if scan.normals is None else _outwards(cloud), closed)
@@ -172,6 +174,26 @@ def _settled_without_strays(cloud: _Cloud) -> tuple[_Cloud, float]:
     keep = ~wrong | (wrong[near].mean(axis=1) > 0.5)  # many side by side are a place that is too sharp for this surface
     cloud = cloud._replace(points=cloud.points[keep], normals=cloud.normals[keep], reach=cloud.reach[keep])
     return cloud, cell
+
+
+def _check_slices(scan: Scan) -> None:
+    """A surface is found among points whose neighbours lie around them, not along one contour."""
+    if scan.slices is None:
+        return
+    points, slices = np.asarray(scan.points, np.float64), np.asarray(scan.slices)
+    within, between = np.zeros((2, len(points)))
+    for number in np.unique(slices):
+        here = slices == number
+        own = KDTree(points[here])
+        within[here] = own.query(points[here], 2)[0][:, 1]  # infinite for a point alone
+        between[here] = KDTree(points[~here]).query(points[here])[0] if not here.all() else np.inf
+    apart, along = np.median(between), np.median(within)
+    if apart > _SLICES_APART * along:
+        where = f"in slices {apart:.1f} mm apart" if np.isfinite(apart) else "in one slice"
+        raise ScanError(
+            f"the scan is contours {where}, with a point every {along:.1f} mm: too far apart for a control mesh to be "
+            "made of them. Give a template (--control, or `fit_scan(scan, mesh)`)."
+        )
 
 
 def _cleaned(scan: Scan) -> _Cloud:

@@ -202,6 +202,23 @@ def test_refuses(case):
 
 
 @needs_extra
+def test_refuses_contours_that_lie_far_apart():
+    angles, heights = np.linspace(0, 2 * np.pi, 180, endpoint=False), np.linspace(-25, 25, 51)
+    slices, angles = (grid.ravel() for grid in np.meshgrid(np.arange(51), angles, indexing="ij"))
+    radius = np.sqrt(30**2 - heights[slices] ** 2)
+    tube = np.stack([radius * np.cos(angles), radius * np.sin(angles), heights[slices]], axis=1)
+    apart = slices % 10 == 0
+    words = r"contours in slices 10\.\d mm apart, with a point every 0\.\d mm.*Give a template \(--control"
+    with pytest.raises(ScanError, match=words):
+        control_mesh(Scan(tube[apart], slices=slices[apart]), faces=100)
+    with pytest.raises(ScanError, match="contours in one slice, with a point"):
+        control_mesh(Scan(tube[slices == 10], slices=slices[slices == 10]), faces=100)
+    together = control_mesh(Scan(tube, slices=slices), faces=100)
+    inside = np.abs(together.vertices[:, 2]) < 24
+    np.testing.assert_allclose(np.linalg.norm(together.vertices[inside], axis=1), 30, atol=0.5)
+
+
+@needs_extra
 @pytest.mark.parametrize("scale", [0.001, 1000.0])
 def test_scan_that_is_hardly_in_mm_is_told(scale):
     points = ball() * scale
