@@ -51,21 +51,24 @@ def test_splitting_goes_on_until_the_tolerance_is_met():
 
 
 def test_fit_that_was_stopped_after_a_split_goes_on_there(tmp_path):
-    """Without alignment and first fit, to the same end as one that was not stopped."""
-    mesh, _ = mesh_and_scan()
+    """Without alignment and first fit, to the same end as one that was not stopped, in a hole of the scan too."""
+    (mesh, _), points = mesh_and_scan(), np.asarray(rippled().points)
+    scan = Scan(points[points[:, 2] < 9])
     how = {"levels": 1, "tolerance_mm": 0.08, "max_sweeps": 6, "throw": False}
     stages, more_stages, numbers = [], [], []
-    whole = fit_scan(rippled(), mesh, **how)
+    whole = fit_scan(scan, mesh, **how)
 
     def stop(sweep: fitting.Sweep) -> None:
         if len(stages) == 3 and sweep.number > 2:  # the alignment, a fit, and the one after the split
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fit_scan(rippled(), mesh, checkpoint=tmp_path, on_stage=stages.append, on_sweep=stop, **how)
+        fit_scan(scan, mesh, checkpoint=tmp_path, on_stage=stages.append, on_sweep=stop, **how)
     assert sorted(path.name for path in tmp_path.iterdir()) == [CHECKPOINT, CHECKPOINT_START]
+    with np.load(tmp_path / CHECKPOINT_START) as kept:
+        assert 0 < kept["unseen"].sum() < len(kept["unseen"])  # faces in the hole, which stay as they were filled
     tell = {"on_stage": more_stages.append, "on_sweep": lambda sweep: numbers.append(sweep.number)}
-    again = fit_scan(rippled(), mesh, checkpoint=tmp_path, **tell, **how)
+    again = fit_scan(scan, mesh, checkpoint=tmp_path, **tell, **how)
     assert more_stages[:2] == ["goes on where it was stopped", stages[2]] and numbers[0] == 3
     assert again.splits == whole.splits >= 1 and again.outcome == whole.outcome
     assert again.result.recipe.to_json() == whole.result.recipe.to_json()
