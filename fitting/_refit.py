@@ -18,8 +18,8 @@ from ._posterior import Posterior
 from ._residuals import Pairs, Rows, Start, residuals
 from ._symmetry import Mirror
 
-_MOST_STEPS = 200
-_TOLERANCE = 1e-8  # of the solution and of its derivative, in posterior standard deviations
+_MOST_STEPS = 40
+_RESTART, _MOST_PRODUCTS = 60, 600
 _MOST_UNKNOWNS = 8000  # whose posterior is whitened, in 512 MB
 
 
@@ -72,29 +72,33 @@ class Refit(eqx.Module):
         if points.shape != fixed.pairs.points.shape:
             raise ValueError(f"the fit had points {list(fixed.pairs.points.shape)}; got {list(points.shape)}.")
         weights = jnp.ones_like(points[:, 0]) if weights is None else weights
-        found = optx.fixed_point(
-            _newton_step,
-            optx.FixedPointIteration(rtol=0.0, atol=_tolerance(points)),
+        of_solution, of_derivative = _tolerances(points)
+        found = optx.root_find(
+            _slope,
+            optx.Newton(rtol=0.0, atol=of_solution, linear_solver=_linear(of_solution / 10)),
             jnp.zeros(fixed.whitening.shape[1], points.dtype),
             args=(points, weights, fixed),
-            # The Hessian is nearly the identity in these unknowns.
-            adjoint=optx.ImplicitAdjoint(linear_solver=lx.BiCGStab(rtol=_tolerance(points), atol=_tolerance(points))),
+            adjoint=optx.ImplicitAdjoint(linear_solver=_linear(of_derivative)),
             max_steps=_MOST_STEPS,
         )
         offset, start = to_unknowns(fixed.whitening @ found.value, fixed.zero), fixed.start
         return apply_offset(start.topology, start.scheme, start.control, offset)
 
 
-def _newton_step(z: Float[Array, "u"], args: tuple[Array, Array, _Fixed]) -> Float[Array, "u"]:
-    """In whitened unknowns the Hessian is nearly the identity: a step down the gradient is nearly Newton's.
-
-    Half of it, so that curvature that the posterior leaves out, up to three times its own, does no harm.
-    """
-    return z - 0.5 * jax.grad(_cost)(z, *args)
+def _slope(z: Float[Array, "u"], args: tuple[Array, Array, _Fixed]) -> Float[Array, "u"]:
+    return jax.grad(_cost)(z, *args)
 
 
-def _tolerance(points: Float[Array, "p 3"]) -> float:
-    return max(_TOLERANCE, 1e3 * float(jnp.finfo(points.dtype).eps))
+def _linear(tolerance: float) -> lx.AbstractLinearSolver:
+    # In whitened unknowns the Hessian is nearly the identity, but for the curvature that the posterior leaves out: that
+    # is several times as much where residuals are large, and may be negative.
+    return lx.GMRES(rtol=tolerance, atol=tolerance, restart=_RESTART, max_steps=_MOST_PRODUCTS)
+
+
+def _tolerances(points: Float[Array, "p 3"]) -> tuple[float, float]:
+    """Of the solution, in posterior standard deviations, and, as a part, of its derivative."""
+    eps = float(jnp.finfo(points.dtype).eps)
+    return max(1e-8, 3e5 * eps), max(1e-8, 1e3 * eps)
 
 
 def _cost(
