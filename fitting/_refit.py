@@ -37,6 +37,8 @@ class _Fixed(NamedTuple):
     mirror: Mirror | None
     whitening: Float[Array, "n u"]
     """Takes unknowns of variance 1, as the posterior has them, to offsets."""
+    left: Float[Array, "u"]
+    """Slope of the cost where the fit ended: not all of a surface comes to rest."""
 
 
 @final
@@ -47,6 +49,8 @@ class Refit(eqx.Module):
     `jax.jit` and `jax.vmap`: the control that the fit would find from these points if every point kept its surface
     point, its direction and its robust weight, and if the noise, the strength of the priors, the plane of symmetry and
     the shifts of slices stayed what they were.
+
+    From the scan's own points it is the fit's own, also where the fit was not quite at rest.
 
     The derivative is that of the solution, not of the steps to it: of the volume of a fitted organ, say, by each of the
     scan points that it came from.
@@ -86,7 +90,7 @@ class Refit(eqx.Module):
 
 
 def _slope(z: Float[Array, "u"], args: tuple[Array, Array, _Fixed]) -> Float[Array, "u"]:
-    return jax.grad(_cost)(z, *args)
+    return jax.grad(_cost)(z, *args) - args[-1].left
 
 
 def _linear(tolerance: float) -> lx.AbstractLinearSolver:
@@ -137,16 +141,18 @@ def make_refit(posterior: Posterior) -> Refit:
         return jnp.asarray(values, dtype)
 
     mirror = problem.mirror(posterior.control)
-    return Refit(
-        _Fixed(
-            start=problem.start(posterior.scheme, posterior.control),
-            pairs=posterior.seen.pairs,
-            zero=no_offset(problem.free, posterior.scheme, posterior.control),
-            shifts=None if posterior.shifts is None else on_device(posterior.shifts.of_points()),
-            precisions=on_device(problem.distance_precisions(posterior.seen)),
-            prior_precisions=Rows(*map(on_device, problem.prior_precisions())),
-            hold=on_device(problem.loose),
-            mirror=jax.tree.map(lambda a: on_device(a) if a.dtype.kind == "f" else a, mirror),
-            whitening=on_device(whitening),
-        )
+    fixed = _Fixed(
+        start=problem.start(posterior.scheme, posterior.control),
+        pairs=posterior.seen.pairs,
+        zero=no_offset(problem.free, posterior.scheme, posterior.control),
+        shifts=None if posterior.shifts is None else on_device(posterior.shifts.of_points()),
+        precisions=on_device(problem.distance_precisions(posterior.seen)),
+        prior_precisions=Rows(*map(on_device, problem.prior_precisions())),
+        hold=on_device(problem.loose),
+        mirror=jax.tree.map(lambda a: on_device(a) if a.dtype.kind == "f" else a, mirror),
+        whitening=on_device(whitening),
+        left=jnp.zeros(whitening.shape[1], dtype),
     )
+    points = fixed.pairs.points if fixed.shifts is None else fixed.pairs.points - fixed.shifts  # the scan's own
+    left = jax.grad(_cost)(fixed.left, points, jnp.ones_like(points[:, 0]), fixed)
+    return Refit(fixed._replace(left=left))

@@ -353,6 +353,30 @@ def test_derivatives_of_the_fit_are_those_of_differences():
         np.testing.assert_allclose(jnp.vdot(gradients[which], along), (ahead - back) / (2 * step), rtol=1e-3)
 
 
+def test_refit_starts_from_the_fit_where_that_was_not_quite_at_rest():
+    """Eyes and ears that the control mesh cannot follow: there the cost is not even convex."""
+    scan, template = fitting.example("head_fragment")
+    scan, mesh = Scan(np.asarray(scan.points, float)), js.ControlMesh(template.vertices, template.faces)
+    topology = js.build_topology(mesh, js.Interpolating(), 1)
+    found = fitting.fit(js.Interpolating(), topology, mesh.control(), scan, throw=False)
+    refit = found.refit()
+    assert float(jnp.linalg.norm(refit._fixed.left)) > 1  # in posterior standard deviations
+
+    @jax.jit
+    def rise(points, refit):
+        def value(points):
+            _, control = refit(points)
+            return jnp.mean(control.vertices**2), control
+
+        return jax.value_and_grad(value, has_aux=True)(points)
+
+    (_, control), slope = rise(scan.points, refit)
+    np.testing.assert_allclose(control.vertices, found.control.vertices, atol=1e-9)
+    along = jnp.asarray(np.random.default_rng(0).normal(size=slope.shape))
+    ahead, back = (rise(scan.points + s * along, refit)[0][0] for s in (1e-5, -1e-5))
+    np.testing.assert_allclose(jnp.vdot(slope, along), (ahead - back) / 2e-5, rtol=1e-3)
+
+
 def test_refit_refuses_what_it_cannot_do(monkeypatch):
     found = problem().fit(max_sweeps=1)
     with pytest.raises(ValueError, match=r"the fit had points \[600, 3\]; got \[599, 3\]"):
