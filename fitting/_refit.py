@@ -38,7 +38,7 @@ class _Fixed(NamedTuple):
     whitening: Float[Array, "n u"]
     """Takes unknowns of variance 1, as the posterior has them, to offsets."""
     left: Float[Array, "u"]
-    """Slope of the cost where the fit ended: not all of a surface comes to rest."""
+    """Slope of the cost where the fit ended, which the solution keeps: not all of a surface comes to rest."""
 
 
 @final
@@ -50,10 +50,9 @@ class Refit(eqx.Module):
     point, its direction and its robust weight, and if the noise, the strength of the priors, the plane of symmetry and
     the shifts of slices stayed what they were.
 
-    From the scan's own points it is the fit's own, also where the fit was not quite at rest.
-
-    The derivative is that of the solution, not of the steps to it: of the volume of a fitted organ, say, by each of the
-    scan points that it came from.
+    From the scan's own points it is the fit's own control: where the fit was not quite at rest, the slope of the cost
+    that it left stays. The derivative is that of the solution, not of the steps to it: of the volume of a fitted organ,
+    say, by each of the scan points that it came from.
     """
 
     _fixed: _Fixed
@@ -69,8 +68,7 @@ class Refit(eqx.Module):
 
         Raises:
             ValueError: another number of points than the scan has.
-            EquinoxRuntimeError: the solve does not converge: the points are too far from the scan's, or the residuals
-                so large beside the noise that the cost is not convex about the fit.
+            EquinoxRuntimeError: the solve does not converge: the points are too far from the scan's.
         """
         fixed = self._fixed
         if points.shape != fixed.pairs.points.shape:
@@ -154,5 +152,5 @@ def make_refit(posterior: Posterior) -> Refit:
         left=jnp.zeros(whitening.shape[1], dtype),
     )
     points = fixed.pairs.points if fixed.shifts is None else fixed.pairs.points - fixed.shifts  # the scan's own
-    left = jax.grad(_cost)(fixed.left, points, jnp.ones_like(points[:, 0]), fixed)
+    left = jax.jit(jax.grad(_cost))(fixed.left, points, jnp.ones_like(points[:, 0]), fixed)
     return Refit(fixed._replace(left=left))
