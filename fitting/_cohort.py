@@ -334,7 +334,8 @@ def _sweep(common: _Common, subject: _Subject, expected: Expected, state: _State
     at = search_closest(surface, subject.scan.points)
     seen = measure(surface, subject.scan, at, common.open_vertices, subject.around, edge, floor, common.loss)
 
-    stiff = STIFFER / jnp.mean(bend_asymmetry(surface, common.bend_edges) ** 2)
+    own = with_control_vertices(topology, common.scheme, control, surface)
+    stiff = STIFFER / jnp.mean(bend_asymmetry(own, common.bend_edges) ** 2)
     stiffest = jnp.where(k > 0, state.stiff, stiff)
     softer = SOFTER ** k.astype(edge.dtype)
     bend = jnp.maximum(common.bend, stiffest * softer)

@@ -65,7 +65,8 @@ class Cohort:
         seen = View(scan, surface, edge, recipe.loss).seen_from(surface)
         problem = Problem(recipe.scheme, topology, start, recipe.free, recipe.priors)
         own, of_all = problem.found(), self._problem.found()  # the template and its bends, and the strengths
-        problem.tell(of_all._replace(template=own.template, expected=own.expected.only(of_all.expected)))
+        expected = own.expected.only(of_all.expected)
+        problem.tell(of_all._replace(template=own.template, expected=expected, hold=own.hold))
         counted, ends = slice(None, int(self.sweeps[i]) + 1), optx.RESULTS
         stopped = ends.nonlinear_max_steps_reached if self._finite[i] else ends.nonfinite
         return FitResult(

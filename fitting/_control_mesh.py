@@ -33,6 +33,7 @@ _COARSE_CELLS = 50
 _TURNS = 6
 _SMOOTHER = (1.0, 1.5, 2.5)
 _SLICES_APART = 4.0  # times the spacing of the points in them: ten neighbours lie on one contour
+_FLAT = 0.3  # thickness of a slice over its width
 # A point is dropped where it lies thinly and its neighbours make no plane: sparse but smooth parts stay.
 _THIN, _THICK = 1.7, 0.15
 _FAR_OFF = 5.0  # robust standard deviations from the surface
@@ -99,7 +100,6 @@ def control_mesh(
     if faces < _LEAST_FACES:
         raise ValueError(f"`faces` must be {_LEAST_FACES} or more; got {faces}.")
     _need_extra()
-    _check_slices(scan)
     cloud = _cleaned(scan)
     _warn_of_unit(float(np.linalg.norm(np.ptp(cloud.points, axis=0))))
     cloud, dense, topology = _simplest(cloud if scan.normals is None else _outwards(cloud), closed)
@@ -176,23 +176,26 @@ def _settled_without_strays(cloud: _Cloud) -> tuple[_Cloud, float]:
     return cloud, cell
 
 
-def _check_slices(scan: Scan) -> None:
+def _check_slices(points: Float[np.ndarray, "p 3"], slices: Int[np.ndarray, "p"]) -> None:
     """A surface is found among points whose neighbours lie around them, not along one contour."""
-    if scan.slices is None:
+    within, between, numbers = *np.zeros((2, len(points))), np.unique(slices)
+    if len(numbers) == 1:
         return
-    points, slices = np.asarray(scan.points, np.float64), np.asarray(scan.slices)
-    within, between = np.zeros((2, len(points)))
-    for number in np.unique(slices):
+    for number in numbers:
         here = slices == number
-        own = KDTree(points[here])
-        within[here] = own.query(points[here], 2)[0][:, 1]  # infinite for a point alone
-        between[here] = KDTree(points[~here]).query(points[here])[0] if not here.all() else np.inf
+        own, others = points[here], points[~here]
+        if len(own) > 3:
+            _, width, thickness = np.linalg.svd(own - own.mean(axis=0), compute_uv=False)
+            if thickness > _FLAT * width:
+                return  # points on all sides are no contour
+        within[here] = KDTree(own).query(own, 2)[0][:, 1]  # infinite for a point alone
+        between[here] = KDTree(others).query(own)[0]
     apart, along = np.median(between), np.median(within)
-    if apart > _SLICES_APART * along:
-        where = f"in slices {apart:.1f} mm apart" if np.isfinite(apart) else "in one slice"
+    cell = np.ptp(points, axis=0).max() / _COARSE_CELLS
+    if apart > max(_SLICES_APART * along, cell):
         raise ScanError(
-            f"the scan is contours {where}, with a point every {along:.1f} mm: too far apart for a control mesh to be "
-            "made of them. Give a template (--control, or `fit_scan(scan, mesh)`)."
+            f"the scan is contours in slices {apart:.1f} mm apart, with a point every {along:.1f} mm: too far apart to "
+            "make a control mesh of them. Give a template (--control, or `fit_scan(scan, mesh)`)."
         )
 
 
@@ -205,6 +208,8 @@ def _cleaned(scan: Scan) -> _Cloud:
         rows = np.sort(np.random.default_rng(0).choice(rows, _AT_MOST, replace=False))
     rows = rows[np.sort(np.unique(points[rows], axis=0, return_index=True)[1])]
     _check_extent(points[rows])
+    if scan.slices is not None:
+        _check_slices(points[rows], np.asarray(scan.slices)[rows])
     for _ in range(2):  # once the most are gone, the rest lies more thinly than it did
         _, off, _ = plane_fits(points[rows])
         reach = neighbour_distance(points[rows], _NEIGHBOUR)

@@ -13,9 +13,9 @@ _COPIES = 4  # of the covariance, where it is kept whole
 
 
 def memory_of_fit(topology: js.Topology, n_points: int) -> float:
-    """About how many bytes a process has to have for a fit and its uncertainty; within a third."""
+    """About how many bytes a process has to have for a fit in float32 and its uncertainty, within a third."""
     n_vertices, n_faces = topology.n_control_vertices, sum(len(faces) for faces in topology.faces.values())
-    n_unknowns = 5 * n_vertices
+    n_unknowns = (5 if topology.fans is None else 3) * n_vertices  # only schemes without normals keep fans
     covariance = _COPIES * 8 * n_unknowns**2 if n_unknowns <= DENSE else 0
     points = _POINT * min(n_points, _AT_ONCE) + _OTHER_POINT * n_points
     return _PROGRAMS + _VERTEX * n_vertices + _FACE * n_faces + points + covariance

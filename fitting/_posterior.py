@@ -20,7 +20,7 @@ from ._problem import Problem, factorise
 from ._residuals import splits_in_four
 from ._shifts import Shifts
 
-DENSE = 4000  # unknowns whose covariance is kept whole, in 130 MB
+DENSE = 4000  # unknowns whose covariance is kept whole, 130 MB a copy
 _DRAWS = 200
 _ROWS_AT_ONCE = 1024
 

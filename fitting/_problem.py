@@ -103,6 +103,8 @@ class Found(NamedTuple):
     likeness: float
     determined: float
     annealed: bool
+    hold: Float[np.ndarray, "n"]
+    """What held the unknowns in the last sweep."""
     anchors: Anchors | None
     symmetry: Symmetry | None = None
     curve: BoundaryCurve | None = None
@@ -227,6 +229,11 @@ class Problem:
             border = border._replace(across=across, gradient=border.gradient + of_prior)
         bends = np.append(rows.bend, rows.height)
         return _Equations(data, prior, gradient, bends, by_priors[: len(bends)], tied, border)
+
+    @property
+    def last_hold(self) -> Float[np.ndarray, "n"]:
+        """What the last sweep held the unknowns by, but no faster than by one turn back."""
+        return np.minimum(self._hold, HOLD * self.loose)
 
     def mirror(self, control: js.Control) -> Mirror | None:
         """The prior of symmetry about here; None where there is none."""
@@ -463,14 +470,14 @@ class Problem:
     def found(self) -> Found:
         """What a problem made anew has to be told, to know as much as this one."""
         of_bends = self._precision, self._expected, self.likeness
-        of_sweeps = self.determined, self.annealed
+        of_sweeps = self.determined, self.annealed, self._hold
         return Found(self._template, *of_bends, *of_sweeps, self._anchors, self._symmetry, self._curve)
 
     def tell(self, found: Found) -> None:
         """Take over what the sweeps of another problem found."""
         self._precision, self.likeness = found.bend_precision, found.likeness
         self._expect(found.expected)
-        self.determined, self.annealed = found.determined, found.annealed
+        self.determined, self.annealed, self._hold = found.determined, found.annealed, found.hold
 
     def memory(self) -> Memory:
         """What `recall` needs, to go on from here."""

@@ -19,7 +19,7 @@ from ._residuals import Pairs, Rows, Start, residuals
 from ._symmetry import Mirror
 
 _MOST_STEPS = 40
-_RESTART, _MOST_PRODUCTS = 60, 600
+_RESTART, _MOST_RESTARTS = 60, 10  # of GMRES, in products with the Hessian
 _MOST_UNKNOWNS = 8000  # whose posterior is whitened, in 512 MB
 
 
@@ -52,7 +52,8 @@ class Refit(eqx.Module):
 
     From the scan's own points it is the fit's own control: where the fit was not quite at rest, the slope of the cost
     that it left stays. The derivative is that of the solution, not of the steps to it: of the volume of a fitted organ,
-    say, by each of the scan points that it came from.
+    say, by each of the scan points that it came from. Control vertices that turned back from sweep to sweep, as where
+    they cannot follow an ear, are held a little: they slip less along the surface than they would.
     """
 
     _fixed: _Fixed
@@ -73,12 +74,14 @@ class Refit(eqx.Module):
         fixed = self._fixed
         if points.shape != fixed.pairs.points.shape:
             raise ValueError(f"the fit had points {list(fixed.pairs.points.shape)}; got {list(points.shape)}.")
-        weights = jnp.ones_like(points[:, 0]) if weights is None else weights
+        dtype = fixed.whitening.dtype
+        points = jnp.asarray(points, dtype)
+        weights = jnp.ones_like(points[:, 0]) if weights is None else jnp.asarray(weights, dtype)
         of_solution, of_derivative = _tolerances(points)
         found = optx.root_find(
             _slope,
             optx.Newton(rtol=0.0, atol=of_solution, linear_solver=_linear(of_solution / 10)),
-            jnp.zeros(fixed.whitening.shape[1], points.dtype),
+            jnp.zeros(fixed.whitening.shape[1], dtype),
             args=(points, weights, fixed),
             adjoint=optx.ImplicitAdjoint(linear_solver=_linear(of_derivative)),
             max_steps=_MOST_STEPS,
@@ -94,7 +97,7 @@ def _slope(z: Float[Array, "u"], args: tuple[Array, Array, _Fixed]) -> Float[Arr
 def _linear(tolerance: float) -> lx.AbstractLinearSolver:
     # In whitened unknowns the Hessian is nearly the identity, but for the curvature that the posterior leaves out: that
     # is several times as much where residuals are large, and may be negative.
-    return lx.GMRES(rtol=tolerance, atol=tolerance, restart=_RESTART, max_steps=_MOST_PRODUCTS)
+    return lx.GMRES(rtol=tolerance, atol=tolerance, restart=_RESTART, max_steps=_MOST_RESTARTS)
 
 
 def _tolerances(points: Float[Array, "p 3"]) -> tuple[float, float]:
@@ -133,6 +136,9 @@ def make_refit(posterior: Posterior) -> Refit:
         )
     whitening = np.zeros((n, int(free.sum())))
     conditional = posterior.matrix.toarray()[: posterior.n_free, : posterior.n_free]  # given the shifts
+    # Where control vertices turned back from sweep to sweep the cost need not be convex, unless they are held.
+    hold = problem.last_hold
+    conditional += np.diag((hold - problem.loose)[free])
     whitening[free] = np.linalg.inv(np.linalg.cholesky(conditional)).T
 
     def on_device(values: object) -> Array:
@@ -146,7 +152,7 @@ def make_refit(posterior: Posterior) -> Refit:
         shifts=None if posterior.shifts is None else on_device(posterior.shifts.of_points()),
         precisions=on_device(problem.distance_precisions(posterior.seen)),
         prior_precisions=Rows(*map(on_device, problem.prior_precisions())),
-        hold=on_device(problem.loose),
+        hold=on_device(hold),
         mirror=jax.tree.map(lambda a: on_device(a) if a.dtype.kind == "f" else a, mirror),
         whitening=on_device(whitening),
         left=jnp.zeros(whitening.shape[1], dtype),

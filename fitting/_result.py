@@ -2,6 +2,7 @@
 
 import functools
 import os
+import warnings
 from typing import final
 
 import numpy as np
@@ -114,7 +115,16 @@ class FitResult:
         """The fitted control as a differentiable function of scan points and weights; see `Refit`.
 
         Shifts of slices are held at what the fit found.
+
+        Warns:
+            UserWarning: the fit did not converge: the derivative is that of where it stopped.
         """
+        if self.result != optx.RESULTS.successful:
+            warnings.warn(
+                "the fit did not converge: what depends on the scan here is the surface where it stopped, not the best "
+                "one. Give more `max_sweeps`.",
+                stacklevel=2,
+            )
         return make_refit(self.posterior)
 
     def on(self, scan: Scan) -> "FitResult":

@@ -25,7 +25,7 @@ from ._scan import Scan
 from ._shifts import find_shifts
 from ._symmetry import symmetry_of
 
-_VERSION = 2  # 1 had no likeness
+_VERSION = 3  # 1 had no likeness, 2 not what held the unknowns
 _FIT, _RECIPE = "fit.npz", "recipe.json"
 _ENDS = ("successful", "nonlinear_max_steps_reached", "nonlinear_divergence", "nonfinite")
 _A_POINT = ("face", "uv", "directions", "distances", "weights", "precisions")
@@ -55,6 +55,7 @@ def save(folder: str | os.PathLike[str], result: FitResult) -> None:
         "likeness": found.likeness,
         "determined": found.determined,
         "annealed": found.annealed,
+        "hold": found.hold,
         "triangles": topology.control_faces[3],
         "quads": topology.control_faces[4],
         "face": seen.at.face,
@@ -176,7 +177,7 @@ def _restored(arrays: dict[str, np.ndarray]) -> FitResult:
     problem = Problem(recipe.scheme, topology, start, recipe.free, recipe.priors, anchors, symmetry, curve)
     expected = Expected(*(arrays[f"expected_{name}"] for name in Expected._fields))
     of_bends = arrays["bend_precision"], expected, float(arrays["likeness"])
-    of_sweeps = float(arrays["determined"]), bool(arrays["annealed"])
+    of_sweeps = float(arrays["determined"]), bool(arrays["annealed"]), arrays["hold"]
     problem.tell(Found(arrays["template"], *of_bends, *of_sweeps, anchors))
     return FitResult(
         control=control,

@@ -48,3 +48,11 @@ def problem() -> Problem:
 def noise(seed: int = 0) -> np.ndarray:
     """Of a scan, in mm."""
     return np.random.default_rng(seed).normal(scale=SIGMA, size=(N_POINTS, 3))
+
+
+def assert_refit_knows_the_fit(result: fitting.FitResult) -> None:
+    """Its cost has the slope that the equations of the fit's sweeps have: nothing that they know is left out."""
+    of, fixed = result.posterior, result.refit()._fixed
+    gradient = of.problem._equations(of.scheme, of.control, of.seen, of.shifts).gradient
+    expected, size = np.asarray(fixed.whitening).T @ gradient, float(np.linalg.norm(fixed.left))
+    np.testing.assert_allclose(fixed.left, expected, rtol=1e-3, atol=1e-3 * size)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import meshes
 import numpy as np
 import pytest
+from scans import assert_refit_knows_the_fit
 
 import fitting
 import jaxsubdiv as js
@@ -166,6 +167,7 @@ def test_saved_fit_knows_its_curve(tmp_path):
 
 def test_refit_keeps_the_boundary_on_the_curve():
     found = fitted(-2.0, True)
+    assert_refit_knows_the_fit(found)
     _, control = found.refit()(found.scan.points + jnp.array([[2.0, 0, 0.5]]))
     x, _, z = np.asarray(control.vertices).T
     assert abs(x.min() + 1) < 0.2 and abs(x.max() - 21) < 0.2 and z[4] > 0.4

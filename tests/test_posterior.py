@@ -312,7 +312,7 @@ def test_uncertainty_from_draws_is_the_exact_one(monkeypatch):
     exact = posterior.uncertainty().surface
     draws = posterior.draws(4000)
     np.testing.assert_allclose(draws @ draws.T / 4000, np.linalg.inv(posterior.matrix.toarray()), atol=0.02)
-    monkeypatch.setattr(_posterior, "_DENSE", 0)
+    monkeypatch.setattr(_posterior, "DENSE", 0)
     monkeypatch.setattr(_posterior, "_DRAWS", 2000)
     np.testing.assert_allclose(posterior.uncertainty().surface, exact, rtol=0.08)
 
@@ -330,7 +330,7 @@ def test_what_is_fixed_is_certain():
 def test_derivatives_of_the_fit_are_those_of_differences():
     p = problem()
     points = jnp.asarray(p.points + noise())
-    refit = p.fit(points, max_sweeps=6).refit()
+    refit = p.fit(points).refit()
     topology = p.topology
 
     def volume(points, weights, refit):
@@ -377,8 +377,24 @@ def test_refit_starts_from_the_fit_where_that_was_not_quite_at_rest():
     np.testing.assert_allclose(jnp.vdot(slope, along), (ahead - back) / 2e-5, rtol=1e-3)
 
 
+def test_refit_runs_under_vmap_and_takes_its_own_precision():
+    p = problem()
+    points = np.asarray(p.points + noise())
+    refit = p.fit(points).refit()
+    both = jnp.asarray(np.stack([points, points + (1.0, 0, 0)]), jnp.float32)
+    of_both = jax.jit(jax.vmap(lambda points: refit(points)[1].vertices))(both)
+    assert of_both.dtype == p.start.vertices.dtype
+    np.testing.assert_allclose(jnp.mean(of_both[1] - of_both[0], axis=0), (1, 0, 0), atol=0.1)
+    np.testing.assert_allclose(of_both[1], refit(both[1])[1].vertices, atol=1e-5)
+
+
+def test_refit_of_a_fit_that_did_not_converge_says_so():
+    with pytest.warns(UserWarning, match="the fit did not converge: what depends on the scan here"):
+        problem().fit(max_sweeps=1).refit()
+
+
 def test_refit_refuses_what_it_cannot_do(monkeypatch):
-    found = problem().fit(max_sweeps=1)
+    found = problem().fit()
     with pytest.raises(ValueError, match=r"the fit had points \[600, 3\]; got \[599, 3\]"):
         found.refit()(jnp.zeros((599, 3)))
     monkeypatch.setattr(_refit, "_MOST_UNKNOWNS", 50)

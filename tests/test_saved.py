@@ -122,8 +122,8 @@ def changed(folder, **arrays) -> None:
 @pytest.mark.parametrize(
     ("arrays", "words"),
     [
-        ({"version": np.array(3)}, "version 3, but this release reads version 2. Update it"),
-        ({"version": np.array(1)}, "version 1, but this release reads version 2. Fit the scan again, by its recipe"),
+        ({"version": np.array(4)}, "version 4, but this release reads version 3. Update it"),
+        ({"version": np.array(1)}, "version 1, but this release reads version 3. Fit the scan again, by its recipe"),
         ({"distances": None}, "'distances' is missing"),
         ({"h": None}, "'h' is missing"),
         ({"uv": np.zeros((5, 2))}, "'uv' has 5 rows for 600 scan points"),

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import meshes
 import numpy as np
 import pytest
-from scans import N_POINTS, noise, problem
+from scans import N_POINTS, assert_refit_knows_the_fit, noise, problem
 from scipy.spatial.transform import Rotation
 
 import fitting
@@ -187,6 +187,7 @@ def test_uncertainty_falls_where_symmetry_tells():
 
 def test_refit_keeps_what_the_prior_says():
     found = fitted(0.01)
+    assert_refit_knows_the_fit(found)
     points, partners = np.array(found.scan.points), find_symmetry(problem().mesh)
     _, again = found.refit()(jnp.asarray(points))
     np.testing.assert_allclose(again.vertices, found.control.vertices, atol=0.02)

@@ -41,7 +41,7 @@ def measure(around: int, across: int, n_points: int, levels: int) -> None:
     told = memory_of_fit(topology, scan.n_points)
     with warnings.catch_warnings(action="ignore"):
         fitting.fit(js.Interpolating(), topology, mesh.control(), scan, max_sweeps=SWEEPS, throw=False).uncertainty()
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1e3  # in kB on Linux
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # KiB on Linux
     print(json.dumps((len(mesh.vertices), n_points, mesh.n_faces * 4**levels, told / 1e9, most / 1e9)))
 
 
