@@ -8,7 +8,7 @@ from ._posterior import DENSE
 # most of it the factors of the normal equations; of a face of the surface; and of a point, as many as are worked on at
 # once, and the others.
 _PROGRAMS, _VERTEX, _FACE = 850e6, 300e3, 3e3
-_POINT, _AT_ONCE, _OTHER_POINT = 2e3, 200_000, 250.0
+_POINT, _AT_ONCE, _OTHER_POINT = 1.7e3, 200_000, 250.0
 _COPIES = 4  # of the covariance, where it is kept whole
 
 
