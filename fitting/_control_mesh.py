@@ -20,6 +20,7 @@ from ._outliers import neighbour_distance
 from ._poisson import Implicit, poisson
 from ._remesh import Coarse, Dense, coarsen, paired, relaxed
 from ._scan import Scan, ScanError
+from ._shifts import contour_spacing
 
 FaceKind: TypeAlias = Literal["triangle", "quad"]
 
@@ -178,25 +179,25 @@ def _settled_without_strays(cloud: _Cloud) -> tuple[_Cloud, float]:
 
 def _check_slices(points: Float[np.ndarray, "p 3"], slices: Int[np.ndarray, "p"]) -> None:
     """A surface is found among points whose neighbours lie around them, not along one contour."""
-    within, between, numbers = *np.zeros((2, len(points))), np.unique(slices)
-    if len(numbers) == 1:
-        return
-    for number in numbers:
-        here = slices == number
-        own, others = points[here], points[~here]
-        if len(own) > 3:
-            _, width, thickness = np.linalg.svd(own - own.mean(axis=0), compute_uv=False)
-            if thickness > _FLAT * width:
-                return  # points on all sides are no contour
-        within[here] = KDTree(own).query(own, 2)[0][:, 1]  # infinite for a point alone
-        between[here] = KDTree(others).query(own)[0]
-    apart, along = np.median(between), np.median(within)
+    numbers = np.unique(slices)
+    if len(numbers) == 1 or not all(_is_flat(points[slices == number]) for number in numbers):
+        return  # points on all sides are no contour
+    nearest, within, between = contour_spacing(points, slices)
+    alone = nearest == np.arange(len(points))
+    apart, along = np.median(between), np.median(np.where(alone, np.inf, within))
     cell = np.ptp(points, axis=0).max() / _COARSE_CELLS
     if apart > max(_SLICES_APART * along, cell):
         raise ScanError(
             f"the scan is contours in slices {apart:.1f} mm apart, with a point every {along:.1f} mm: too far apart to "
             "make a control mesh of them. Give a template (--control, or `fit_scan(scan, mesh)`)."
         )
+
+
+def _is_flat(points: Float[np.ndarray, "p 3"]) -> bool:
+    if len(points) < 4:
+        return True
+    _, width, thickness = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(thickness <= _FLAT * width)
 
 
 def _cleaned(scan: Scan) -> _Cloud:

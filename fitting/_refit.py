@@ -96,7 +96,7 @@ def _slope(z: Float[Array, "u"], args: tuple[Array, Array, _Fixed]) -> Float[Arr
 
 def _linear(tolerance: float) -> lx.AbstractLinearSolver:
     # In whitened unknowns the Hessian is nearly the identity, but for the curvature that the posterior leaves out: that
-    # is several times as much where residuals are large, and may be negative.
+    # is several times as much where residuals are large.
     return lx.GMRES(rtol=tolerance, atol=tolerance, restart=_RESTART, max_steps=_MOST_RESTARTS)
 
 

@@ -127,11 +127,11 @@ class Strokes(NamedTuple):
         return self.most if r == 1 else min((1 + r) / (1 - r), self.most)
 
 
-def find_strokes(scan: Scan) -> Strokes | None:
-    """The contours of a scan; None where it has fewer than two slices."""
-    if scan.slices is None or len(np.unique(np.asarray(scan.slices))) < 2:
-        return None
-    points, numbers = np.asarray(scan.points, np.float64), np.asarray(scan.slices)
+def contour_spacing(
+    points: Float[np.ndarray, "p 3"], numbers: Int[np.ndarray, "p"]
+) -> tuple[Int[np.ndarray, "p"], Float[np.ndarray, "p"], Float[np.ndarray, "p"]]:
+    """Of every point in two or more slices: the row of the nearest one of its own slice, how far that is (itself, where
+    it is alone), and how far the nearest one of another slice is."""
     nearest, along, across = np.arange(len(points)), np.zeros(len(points)), np.zeros(len(points))
     for number in np.unique(numbers):
         here = np.flatnonzero(numbers == number)
@@ -139,6 +139,14 @@ def find_strokes(scan: Scan) -> Strokes | None:
         away, rows = nearest_rows(tree, points[here], min(2, len(here)))
         nearest[here], along[here] = here[rows[:, -1]], away[:, -1]
         across[here] = nearest_rows(KDTree(points[numbers != number]), points[here], 1)[0][:, 0]
+    return nearest, along, across
+
+
+def find_strokes(scan: Scan) -> Strokes | None:
+    """The contours of a scan; None where it has fewer than two slices."""
+    if scan.slices is None or len(np.unique(np.asarray(scan.slices))) < 2:
+        return None
+    nearest, along, across = contour_spacing(np.asarray(scan.points, np.float64), np.asarray(scan.slices))
     spacing = float(np.median(along))
     return Strokes(nearest, max(float(np.median(across)) / spacing, 1.0) if spacing > 0 else 1.0)
 

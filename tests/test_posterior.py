@@ -354,7 +354,7 @@ def test_derivatives_of_the_fit_are_those_of_differences():
 
 
 def test_refit_starts_from_the_fit_where_that_was_not_quite_at_rest():
-    """Eyes and ears that the control mesh cannot follow: there the cost is not even convex."""
+    """Eyes and temples that the control mesh cannot follow: without a hold the cost would not even be convex there."""
     scan, template = fitting.example("head_fragment")
     scan, mesh = Scan(np.asarray(scan.points, float)), js.ControlMesh(template.vertices, template.faces)
     topology = js.build_topology(mesh, js.Interpolating(), 1)
