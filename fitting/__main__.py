@@ -18,21 +18,21 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxsubdiv as js
-from jaxsubdiv._compare import SCHEMES
-from jaxsubdiv._files import replacing
-from jaxsubdiv._warnings import plain_warnings
+from jaxsubdiv import SCHEMES
+from jaxsubdiv.console import plain_warnings
+from jaxsubdiv.files import replacing
 
-from ._boundary import BoundaryCurve, boundary_of
-from ._example import Example, example
-from ._fit import CHECKPOINT, Sweep
-from ._fit_scan import CHECKPOINT_START, ScanFit, misfit
-from ._landmarks import Landmarks, match_landmarks, read_landmarks
-from ._page import write_page
-from ._picture import draw_fit, surface_distances
-from ._recipe import Recipe, load_recipe
-from ._result import FitResult
-from ._saved import load
-from ._scan import Scan, read_scan
+from .model.priors.boundary import BoundaryCurve, boundary_of
+from .model.recipe import Recipe, load_recipe
+from .report.page import write_page
+from .report.picture import draw_fit, surface_distances
+from .report.result import FitResult
+from .report.saved import load
+from .run.fit import CHECKPOINT, Sweep
+from .run.fit_scan import CHECKPOINT_START, ScanFit, misfit
+from .scan.example import Example, example
+from .scan.landmarks import Landmarks, match_landmarks, read_landmarks
+from .scan.scan import Scan, read_scan
 
 _EXAMPLE_NOISE = 3.0  # mm: the example starts from a control mesh that is wrong, to show that the fit mends it
 _SCAN_FILES = {".ply", ".xyz", ".csv", ".txt", ".npz", ".vtp", ".vtk", ".stl", ".obj", ".off", ".gii"}

@@ -9,7 +9,6 @@ import jax
 
 from . import _compare
 from ._admissible import warn_of_folds
-from ._errors import MeshError
 from ._io import read_mesh, write_mesh
 from ._mesh import ControlMesh
 from ._normals import Boundary, Weights
@@ -17,7 +16,8 @@ from ._refine import refine
 from ._scheme.base import AbstractScheme, OldNormals
 from ._scheme.interpolating import Interpolating, Twist
 from ._topology import MAX_LEVELS, build_topology
-from ._warnings import plain_warnings
+from .console import plain_warnings
+from .errors import MeshError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ._control import Control
-from ._errors import name_rows
 from ._mesh import ControlMesh
+from .errors import name_rows
 
 
 def admissible_margin(mesh: ControlMesh, control: Control | None = None) -> Float[np.ndarray, "v"]:

@@ -2,7 +2,7 @@
 
 import argparse
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,36 +12,16 @@ from jaxtyping import Float
 
 from ._distance import closest_on_mesh
 from ._draw import draw_surface, view_of
-from ._files import replacing
 from ._io import read_mesh
 from ._mesh import ControlMesh
 from ._refine import refine
-from ._scheme.base import AbstractScheme
-from ._scheme.bezier_triangle import BezierTriangle
-from ._scheme.butterfly import ModifiedButterfly
-from ._scheme.catmull_clark import CatmullClark
-from ._scheme.circle_preserving import CirclePreserving
-from ._scheme.doo_sabin import DooSabin
-from ._scheme.interpolating import Interpolating
-from ._scheme.kobbelt import Kobbelt
-from ._scheme.loop import Loop
+from ._scheme import SCHEMES
 from ._stencils import interpolating_control
 from ._surface import RefinedSurface, sample
 from ._topology import MAX_LEVELS, build_topology
+from .files import replacing
 
 N_SAMPLES = 20_000
-
-SCHEMES: dict[str, Callable[..., AbstractScheme]] = {
-    "interpolating": Interpolating,
-    "circle": CirclePreserving,
-    "bezier-triangle": BezierTriangle,
-    "butterfly": ModifiedButterfly,
-    "kobbelt": Kobbelt,
-    "catmull-clark": CatmullClark,
-    "loop": Loop,
-    "doo-sabin": DooSabin,
-}
-"""Every scheme by its name on the command line."""
 
 
 class Row(NamedTuple):

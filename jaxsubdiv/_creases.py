@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Int
 from numpy.typing import ArrayLike
 
-from ._errors import MeshError, name_rows
 from ._stage import INFINITE, Stage
+from .errors import MeshError, name_rows
 
 Numbers: TypeAlias = ArrayLike | Sequence[Any] | float | int
 """What numpy makes an array of; the checks of annotations in the tests take no plain `ArrayLike` for that."""

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._linalg import cross, dot, norm, take, unit
 from ._surface import RefinedSurface
+from .linalg import cross, dot, norm, take, unit
 
 
 class Curvatures(NamedTuple):

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._control import Control
-from ._linalg import cross, norm, take, unit
 from ._patches import patch_points
 from ._refine import refine
 from ._scheme.base import AbstractScheme
@@ -16,6 +15,7 @@ from ._scheme.bezier_triangle import BezierTriangle, quad_patch, triangle_patch
 from ._scheme.interpolating import edge_rule
 from ._surface import SurfacePoint
 from ._topology import Topology
+from .linalg import cross, norm, take, unit
 
 # Displacements shrink by about a third a level: what all later levels add is 3/2 of what the next one does.
 _ALL_OF_NEXT = 1.5

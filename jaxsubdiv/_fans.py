@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from ._half_edges import HalfEdges
+from .half_edges import HalfEdges
 
 
 def as_table(rows: Int[np.ndarray, "..."]) -> Int[Array, "..."]:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ._fans import as_table
-from ._linalg import take
+from .linalg import take
 
 Matrix: TypeAlias = Any
 """A `scipy.sparse.csr_array`: a row a new vertex, a column an old one. scipy is loaded by the first linear scheme."""

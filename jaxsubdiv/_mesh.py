@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from ._control import Control
-from ._errors import MeshError, name_rows
 from ._fans import mesh_fans
-from ._half_edges import Faces, HalfEdges, half_edges
 from ._normals import Weights, estimate_normals
+from .errors import MeshError, name_rows
+from .half_edges import Faces, HalfEdges, half_edges
 
 # A face whose area is under this part of its longest edge squared has no direction that rounding would not change.
 _FLAT = 1e-12

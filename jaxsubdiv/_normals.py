@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ._fans import Fans
-from ._linalg import Rows, Vectors, cross, dot, largest, take, unit, unit_or, where
+from .linalg import Rows, Vectors, cross, dot, largest, take, unit, unit_or, where
 
 Weights: TypeAlias = Literal["area", "uniform", "angle", "sphere"]
 """How the corner normals around a vertex are weighed in (6)."""

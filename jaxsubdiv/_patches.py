@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ._linalg import take
 from ._stage import Sides, Stage
+from .linalg import take
 
 Coordinate: TypeAlias = Float[Array, "p"]
 

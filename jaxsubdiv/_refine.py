@@ -5,11 +5,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._control import Control
-from ._linalg import cross, largest, unit, unit_or
 from ._normals import fan_normals
 from ._scheme.base import AbstractScheme
 from ._surface import RefinedSurface
 from ._topology import Level, LimitMasks, Topology
+from .linalg import cross, largest, unit, unit_or
 
 
 def refine(scheme: AbstractScheme, topology: Topology, control: Control) -> RefinedSurface:

@@ -13,9 +13,9 @@ from scipy.spatial import KDTree
 from trimesh.graph import connected_component_labels
 from trimesh.grouping import unique_rows
 
-from ._errors import MeshError
-from ._half_edges import Faces, HalfEdges, half_edges
 from ._mesh import ControlMesh, check_counts, vector_areas, zero_area
+from .errors import MeshError
+from .half_edges import Faces, HalfEdges, half_edges
 
 # Doubled vertices of files in single precision differ by 6e-8 of their coordinates where they differ at all, but most
 # are exact copies; this is far under the smallest feature and spares vertices that are close on purpose.

@@ -11,10 +11,10 @@ import jax
 import numpy as np
 
 from ._fans import Fan, Fans
-from ._files import replacing
 from ._masks import MaskGroup, Masks
 from ._scheme.bezier_triangle import PatchLevel, Places
 from ._topology import Level, LimitMasks, MaskLevel, Topology
+from .files import replacing
 
 _VERSION = 1
 _KINDS = {

@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ._creases import Numbers, edge_rows
-from ._errors import MeshError, name_rows
-from ._half_edges import Faces
 from ._mesh import ControlMesh, vector_areas
 from ._stage import Sides, Stage, numbers, sides_of, stage_of
+from .errors import MeshError, name_rows
+from .half_edges import Faces
 
 
 class SplitMesh(NamedTuple):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ._half_edges import Faces, HalfEdges, half_edges
+from .half_edges import Faces, HalfEdges, half_edges
 
 INFINITE = 10.0
 """Sharpness that refinement does not wear off, as in OpenSubdiv."""

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from ._linalg import cross, norm, take, unit
+from .linalg import cross, norm, take, unit
 
 
 class RefinedSurface(eqx.Module):

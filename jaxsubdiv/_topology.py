@@ -15,13 +15,13 @@ from jaxtyping import Array, Int
 
 from ._admissible import warn_of_folds
 from ._creases import Creases, Numbers, sharpened
-from ._errors import MeshError
 from ._fans import Fans, as_table, group_corners, mesh_fans
-from ._half_edges import Faces, half_edges
 from ._masks import Masks
 from ._mesh import ControlMesh
 from ._seams import sewn
 from ._stage import Stage, numbers, stage_of
+from .errors import MeshError
+from .half_edges import Faces, half_edges
 
 MAX_LEVELS = 8
 _MAX_INDEX = np.iinfo(np.int32).max

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import fitting
 import jaxsubdiv as js
 from fitting import Landmarks, Scan, ScanError
-from fitting._align import _surface
+from fitting.start.align import _surface
 
 SIZE = 100.0
 FAR = Rotation.from_rotvec(np.array([0.4, -0.7, 0.6]) / np.linalg.norm([0.4, -0.7, 0.6]) * np.pi)

@@ -11,8 +11,8 @@ from scans import assert_refit_knows_the_fit
 import fitting
 import jaxsubdiv as js
 from fitting import BoundaryCurve, Free, Scan, ScanError, _elements, boundary_of
-from fitting._boundary import held_vertices, pair_with_boundary
-from fitting._correspondence import nearest_on_segments
+from fitting.model.priors.boundary import held_vertices, pair_with_boundary
+from fitting.scan.closest_points import nearest_on_segments
 
 N_POINTS = 400
 

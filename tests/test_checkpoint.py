@@ -8,7 +8,7 @@ from scans import noise, problem
 import fitting
 import jaxsubdiv as js
 from fitting import Free, Priors
-from fitting._fit import CHECKPOINT
+from fitting.run.fit import CHECKPOINT
 
 
 class Stopped(Exception):

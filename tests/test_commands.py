@@ -247,7 +247,7 @@ def test_options_of_a_fit_reach_it(files, monkeypatch, options, scheme, levels, 
         seen.append((scheme, levels, max_sweeps))
         raise ValueError("seen enough")
 
-    monkeypatch.setattr("fitting._fit_scan.fit_scan", told)
+    monkeypatch.setattr("fitting.run.fit_scan.fit_scan", told)
     assert run(fit, "scan.xyz", "--control", "control.obj", *options.split()) == 2
     [(found, *numbers)] = seen
     assert type(found) is type(scheme) and found.h == scheme.h and numbers == [levels, max_sweeps]
@@ -272,7 +272,7 @@ def test_options_of_a_start_reach_it(files, monkeypatch, options, expected):
         seen.append(how)
         raise ValueError("seen enough")
 
-    monkeypatch.setattr("fitting._fit_scan.fit_scan", told)
+    monkeypatch.setattr("fitting.run.fit_scan.fit_scan", told)
     assert run(fit, "scan.xyz", "--control", "control.obj", *options.split()) == 2
     assert {name: seen[0][name] for name in expected} == expected
 
@@ -284,7 +284,7 @@ def test_symmetry_and_boundary_reach_the_fit(files, monkeypatch, capsys):
         seen.append((how["priors"], how["boundary"]))
         raise ValueError("seen enough")
 
-    monkeypatch.setattr("fitting._fit_scan.fit_scan", told)
+    monkeypatch.setattr("fitting.run.fit_scan.fit_scan", told)
     rim = np.array([(1.0, 2, 3), (4, 5, 6)])
     np.savetxt("rim.xyz", rim)
     js.write_mesh("open.ply", js.ControlMesh(*open_pyramid()))
@@ -375,7 +375,7 @@ def test_recipe_of_a_fit_has_the_settings_and_options_come_before_it(files, monk
         seen.append(how)
         raise ValueError("seen enough")
 
-    monkeypatch.setattr("fitting._fit_scan.fit_scan", told)
+    monkeypatch.setattr("fitting.run.fit_scan.fit_scan", told)
     assert run(fit, "next.xyz", *again, "--levels", 2, "--align", "rigid", "--no-closed", "--scheme", "circle") == 2
     changed = {"levels": 2, "pose": "rigid", "closed": False, "max_sweeps": 1, "faces": 77}
     assert {name: seen[0][name] for name in changed} == changed and isinstance(seen[0]["scheme"], js.CirclePreserving)

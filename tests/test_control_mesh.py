@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 
 import jaxsubdiv as js
 from fitting import Scan, ScanError, control_mesh, topology_of
-from fitting._align import _surface
-from fitting._orient import orient, plane_fits
-from fitting._poisson import poisson
-from fitting._remesh import Coarse, _collapsed, paired
+from fitting.start.align import _surface
+from fitting.start.orient import orient, plane_fits
+from fitting.start.poisson import poisson
+from fitting.start.remesh import Coarse, _collapsed, paired
 
 needs_extra = pytest.mark.skipif(
     any(not __import__("importlib.util").util.find_spec(name) for name in ("pyvista", "pyacvd", "rustworkx")),

@@ -8,8 +8,9 @@ import pytest
 import trimesh
 
 import jaxsubdiv as js
-from fitting import _correspondence, closest_points
-from fitting._correspondence import boundary_vertices
+from fitting import closest_points
+from fitting.scan import closest_points as module
+from fitting.scan.closest_points import boundary_vertices
 
 GOLDEN = (5**0.5 - 1) / 2
 
@@ -176,7 +177,7 @@ def test_many_points_go_in_parts_with_the_same_result(monkeypatch, at_once):
     surface = surface_of(TRIANGLES["one large among small"])
     points = some_points(surface)[::9]
     whole = closest_points(surface, points)
-    monkeypatch.setattr(_correspondence, "_PAIRS_AT_ONCE", at_once)
+    monkeypatch.setattr(module, "_PAIRS_AT_ONCE", at_once)
     parts = closest_points(surface, points)
     np.testing.assert_array_equal(parts.face, whole.face)
     np.testing.assert_array_equal(parts.uv, whole.uv)

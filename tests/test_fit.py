@@ -19,9 +19,7 @@ import fitting
 import jaxsubdiv as js
 from fitting import Free, Priors, Scan, ScanError, _fit
 from fitting.__main__ import main as fitting_command
-from fitting._elements import differentiate
-from fitting._free import apply_offset, no_offset, tangents
-from fitting._residuals import (
+from fitting.model.residual import (
     Pairs,
     Start,
     bend_asymmetry,
@@ -30,6 +28,8 @@ from fitting._residuals import (
     control_faces_of,
     residuals,
 )
+from fitting.model.unknowns import apply_offset, no_offset, tangents
+from fitting.solve.elements import differentiate
 
 LOOSE = Priors(bend=10.0, stretch=10.0, h=10.0)
 """Priors that leave everything to the scan; where it says nothing they still hold the fit together."""

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 import fitting
 import jaxsubdiv as js
 from fitting import Landmarks, Scan, fit_scan, misfit
-from fitting._fit import CHECKPOINT
-from fitting._fit_scan import CHECKPOINT_START, _outcome
+from fitting.run.fit import CHECKPOINT
+from fitting.run.fit_scan import CHECKPOINT_START, _outcome
 
 
 def mesh_and_scan(**scan) -> tuple[js.ControlMesh, Scan]:

@@ -9,8 +9,9 @@ import pytest
 
 import fitting
 import jaxsubdiv as js
-from fitting import _fit, _problem
-from fitting._folds import Folds, unfolded_start
+from fitting.run import fit as run_fit
+from fitting.solve import problem as solve_problem
+from fitting.start.folds import Folds, unfolded_start
 
 INSIDE = 2  # of the sheet's faces: a vertex with three neighbours stands in it
 
@@ -191,18 +192,18 @@ def test_cohort_starts_without_faces_upside_down_too():
 def test_step_that_turns_faces_over_is_taken_again_and_shorter(monkeypatch):
     mesh, turned = with_three_neighbours(), []
     start = mesh.vertices + np.random.default_rng(1).normal(scale=(1.5, 1.5, 3), size=mesh.vertices.shape)
-    apply = _fit._apply
+    apply = run_fit._apply
 
     def watched(*arguments):
         scheme, control = apply(*arguments)
         turned.append(int(folds(mesh).turned_over(np.asarray(control.vertices)).sum()))
         return scheme, control
 
-    monkeypatch.setattr(_fit, "_apply", watched)
+    monkeypatch.setattr(run_fit, "_apply", watched)
     rough = {"priors": fitting.Priors(likeness=0.0)}  # the noise of the start's shape is not to be expected
     fit_from(start, **rough)
     with_care = max(turned)
     turned.clear()
-    monkeypatch.setattr(_problem, "_TRIES", 1)
+    monkeypatch.setattr(solve_problem, "_TRIES", 1)
     fit_from(start, **rough)
     assert with_care == 0 < max(turned)

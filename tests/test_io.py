@@ -19,9 +19,9 @@ from hypothesis.extra.numpy import arrays
 from meshes import cube, grid, mixed_closed, octahedron, two_components
 
 from jaxsubdiv import _io
-from jaxsubdiv._errors import MeshError
 from jaxsubdiv._io import PointCloud, read_mesh, read_points, write_mesh
 from jaxsubdiv._mesh import ControlMesh
+from jaxsubdiv.errors import MeshError
 
 SUFFIXES = (".obj", ".ply", ".off", ".vtp", ".vtk", ".npz")
 """Formats that hold everything a mesh has."""

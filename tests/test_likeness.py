@@ -13,9 +13,9 @@ from scans import SIGMA, assert_refit_knows_the_fit, problem
 import fitting
 import jaxsubdiv as js
 from fitting import Free, Priors
-from fitting._evidence import next_likeness
-from fitting._problem import Problem
-from fitting._residuals import Expected, bend_asymmetry, bend_edges, bend_height
+from fitting.model.residual import Expected, bend_asymmetry, bend_edges, bend_height
+from fitting.solve.problem import Problem
+from fitting.solve.strengths import next_likeness
 
 SCHEME = js.Interpolating(1.2)
 
@@ -233,7 +233,7 @@ def test_split_mesh_is_expected_to_stay_as_it_is_where_there_are_no_points(monke
         fits.append((control, options, found))
         return found
 
-    monkeypatch.setattr(fitting._fit_scan, "fit", fit_and_tell)
+    monkeypatch.setattr(fitting.run.fit_scan, "fit", fit_and_tell)
     mesh = js.ControlMesh(anatomy().template.vertices, anatomy().mesh.faces, anatomy().template.normals)
     options = {"levels": 1, "pose": None, "tolerance_mm": 1e-3, "most_faces": 4 * mesh.n_faces, "max_sweeps": 8}
     result = fitting.fit_scan(anatomy().scan, mesh, scheme=SCHEME, throw=False, **options).result

@@ -15,8 +15,8 @@ from meshes import (
     two_components,
 )
 
-from jaxsubdiv._errors import MeshError
 from jaxsubdiv._mesh import ControlMesh
+from jaxsubdiv.errors import MeshError
 
 SQUARE = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
 

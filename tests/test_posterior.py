@@ -13,8 +13,14 @@ from schemes import MIXED, control_mesh, random_control
 
 import fitting
 import jaxsubdiv as js
-from fitting import Free, Priors, Scan, _elements, _posterior, _refit
-from fitting._elements import (
+from fitting import Free, Priors, Scan
+from fitting.model.residual import Pairs, Start, bend_edges, control_edges, control_faces_of, prior_faces, residuals
+from fitting.model.unknowns import no_offset
+from fitting.report import posterior as _posterior
+from fitting.report import refit as _refit
+from fitting.report.misfit import misfit_variances
+from fitting.solve import elements as _elements
+from fitting.solve.elements import (
     differentiate,
     differentiate_distances,
     find_elements,
@@ -25,10 +31,7 @@ from fitting._elements import (
     normal_matrix,
     to_unknowns,
 )
-from fitting._evidence import neighbourhoods, next_precision
-from fitting._free import no_offset
-from fitting._misfit import misfit_variances
-from fitting._residuals import Pairs, Start, bend_edges, control_edges, control_faces_of, prior_faces, residuals
+from fitting.solve.strengths import neighbourhoods, next_precision
 
 # Derivatives by elements
 
@@ -180,7 +183,7 @@ def to_truth(result: fitting.FitResult) -> float:
 
 
 def roughness(result: fitting.FitResult) -> float:
-    bends = fitting._residuals.bend_asymmetry(result.surface, bend_edges(result.scheme, problem().topology))
+    bends = fitting.model.residual.bend_asymmetry(result.surface, bend_edges(result.scheme, problem().topology))
     return float(np.sqrt(np.mean(bends**2)))
 
 

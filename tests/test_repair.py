@@ -17,8 +17,8 @@ from meshes import (
     two_components,
 )
 
-from jaxsubdiv._errors import MeshError
 from jaxsubdiv._mesh import ControlMesh
+from jaxsubdiv.errors import MeshError
 
 CLOSED = {
     "tetrahedron": (tetrahedron(), 2),

@@ -18,9 +18,9 @@ from scipy.spatial import KDTree
 
 import fitting
 import jaxsubdiv as js
-from fitting._coverage import distances_to_scan, vertex_areas, weighted_quantile, worst_places
-from fitting._look import Look, look, surroundings
-from fitting._page import write_page
+from fitting.model.pairing import Look, look, surroundings
+from fitting.report.coverage import distances_to_scan, vertex_areas, weighted_quantile, worst_places
+from fitting.report.page import write_page
 
 
 @functools.cache
@@ -385,7 +385,9 @@ def test_page_of_a_large_surface_stays_under_three_megabytes(tmp_path, monkeypat
     points = np.tile(np.asarray(result.scan.points), (50, 1))
     result.scan, result.distances = fitting.Scan(points), np.tile(result.distances, 50)
     monkeypatch.setattr(fitting.FitResult, "points", points)
-    monkeypatch.setattr("fitting._page.distances_to_scan", lambda surface, *_: np.full(len(surface.vertices), np.nan))
+    monkeypatch.setattr(
+        "fitting.report.page.distances_to_scan", lambda surface, *_: np.full(len(surface.vertices), np.nan)
+    )
     write_page(tmp_path / "fit.html", result, uncertainty=False)
     assert len(result.surface.vertices) > 10_000 and (tmp_path / "fit.html").stat().st_size < 3_000_000
     page = page_of(tmp_path / "fit.html")
@@ -396,6 +398,6 @@ def test_page_of_a_large_surface_stays_under_three_megabytes(tmp_path, monkeypat
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="node reads the script as a browser would")
 def test_script_of_the_page_is_sound_javascript():
-    script = Path(fitting.__file__).parent / "_page.js"
+    script = Path(fitting.__file__).parent / "report" / "page.js"
     subprocess.run(["node", "--check", script], check=True, timeout=60)
     assert "</" not in script.read_text(encoding="utf-8")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fitting import Barron, Huber, LeastSquares, Tukey, cauchy, geman_mcclure
-from fitting._outliers import dense_points, scattered_points
-from fitting._robust import noise_scale
+from fitting.model.robust import noise_scale
+from fitting.scan.outliers import dense_points, scattered_points
 
 R = np.linspace(-12, 12, 97)
 

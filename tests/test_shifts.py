@@ -11,7 +11,7 @@ from scans import N_POINTS, assert_refit_knows_the_fit, noise, problem
 import fitting
 import jaxsubdiv as js
 from fitting import Free, Priors, Scan, ScanError, read_scan
-from fitting._shifts import find_shifts, find_strokes
+from fitting.model.priors.shifts import find_shifts, find_strokes
 
 N_SLICES = 10
 PLANTED = 2.0  # mm: standard deviation of the shifts along each axis
@@ -111,7 +111,7 @@ def test_points_of_a_stroke_count_as_few(monkeypatch):
     drawn = Scan(points + stroke * across / np.linalg.norm(across, axis=1, keepdims=True), slices=slices)
     how = {"free": Free(shifts=False), "priors": Priors(likeness=0.0)}
     few = fit_slices(drawn, **how)
-    monkeypatch.setattr("fitting._view.find_strokes", lambda scan: None)
+    monkeypatch.setattr("fitting.model.view.find_strokes", lambda scan: None)
     many = fit_slices(drawn, **how)
     assert off_truth(few) < 0.9 * off_truth(many)
     deviations = [found.uncertainty() for found in (few, many)]

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 import fitting
 import jaxsubdiv as js
 from fitting import Free, Priors, Recipe, Scan, Symmetry, _fit_scan, _symmetry, find_symmetry
-from fitting._elements import flat, to_unknowns
-from fitting._free import apply_offset, no_offset
-from fitting._symmetry import Plane, mirror_at, ties
+from fitting.model.priors.symmetry import Plane, mirror_at, ties
+from fitting.model.unknowns import apply_offset, no_offset
+from fitting.solve.elements import flat, to_unknowns
 
 STRICT = Priors(symmetry=0.01)
 

@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from .._errors import MeshError, name_rows
-from .._files import replacing
 from .._mesh import ControlMesh
+from ..errors import MeshError, name_rows
+from ..files import replacing
 from . import _arrays, _gifti, _obj, _off, _ply, _stl, _table, _vtk
 from ._contents import Contents, VertexData, doubles
 

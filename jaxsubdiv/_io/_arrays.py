@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from .._errors import MeshError
+from ..errors import MeshError
 from ._contents import Contents, VertexData
 
 _MESHES = (

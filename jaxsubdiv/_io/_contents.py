@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from .._errors import MeshError, name_rows
+from ..errors import MeshError, name_rows
 
 
 class Contents(NamedTuple):

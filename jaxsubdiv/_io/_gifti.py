@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._errors import MeshError
+from ..errors import MeshError
 from ._contents import Contents, VertexData, doubles, library, warn, whole
 
 _NORMALS = "Normals"

@@ -10,7 +10,7 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._errors import MeshError, name_rows
+from ..errors import MeshError, name_rows
 from ._contents import Contents, VertexData, by_size, warn
 from ._text import Rows, decode, face_lines, number_lines, parse_rows, token_starts, tokens_per_line
 

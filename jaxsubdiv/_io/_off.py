@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._errors import MeshError
+from ..errors import MeshError
 from ._contents import Contents, VertexData, by_size, check_polygons, whole
 from ._text import decode, face_lines, number_lines, parse_rows
 

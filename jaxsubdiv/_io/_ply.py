@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int, Shaped
 
-from .._errors import MeshError
+from ..errors import MeshError
 from ._contents import Contents, VertexData, check_polygons, doubles, whole
 from ._text import Rows, parse_rows
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._errors import MeshError, name_rows
+from ..errors import MeshError, name_rows
 from ._contents import Contents, VertexData, doubles, warn
 from ._text import decode, parse_rows
 

@@ -8,7 +8,7 @@ from typing import NoReturn
 import numpy as np
 from jaxtyping import Float
 
-from .._errors import MeshError, name_rows
+from ..errors import MeshError, name_rows
 from ._contents import Contents
 from ._text import decode
 

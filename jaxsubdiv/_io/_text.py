@@ -8,7 +8,7 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from .._errors import MeshError
+from ..errors import MeshError
 
 
 class Rows(NamedTuple):

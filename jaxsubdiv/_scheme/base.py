@@ -10,11 +10,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from .._control import strong_float
-from .._linalg import Rows, Vectors, apart, kept_apart, largest, take_each, together, unit, unit_or, where
 from .._masks import Matrix, as_masks, identity, stack
 from .._normals import Boundary, Weights, chord_normals, fan_normals, ring_sum
 from .._stage import Sides, Stage, hybrid_split, sides_of
 from .._topology import AbstractLevel, Level, LimitMasks, MaskLevel, point_normal_level
+from ..linalg import Rows, Vectors, apart, kept_apart, largest, take_each, together, unit, unit_or, where
 from .seams import on_seams
 
 OldNormals: TypeAlias = Literal["keep", "recompute"]

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._fans import as_table
-from .._linalg import Rows, dot, take, unit
 from .._normals import Weights
 from .._stage import Stage, hybrid_split
 from .._topology import AbstractLevel
+from ..linalg import Rows, dot, take, unit
 from .base import AbstractScheme
 
 

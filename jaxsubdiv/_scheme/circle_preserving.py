@@ -6,9 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linalg import Rows, Vectors, apart, dot, take_each, together, unit, where
 from .._normals import Boundary, Weights, chord_normals
 from .._topology import Level
+from ..linalg import Rows, Vectors, apart, dot, take_each, together, unit, where
 from .base import AbstractPointNormalScheme, Edges, tangent_length
 from .interpolating import edge_rule
 

@@ -5,9 +5,9 @@ from typing import ClassVar, Literal, TypeAlias, get_args
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .._linalg import PerRow, Rows, Vectors, dot, take_each
 from .._normals import Boundary, Weights
 from .._topology import Level
+from ..linalg import PerRow, Rows, Vectors, dot, take_each
 from .base import AbstractPointNormalScheme, Edges, OldNormals, check_option, corner_total, tangent_length
 
 Twist: TypeAlias = Literal["zero", "printed"]

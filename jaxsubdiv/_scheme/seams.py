@@ -5,8 +5,8 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linalg import Rows, dot, largest, take
 from .._topology import Level
+from ..linalg import Rows, dot, largest, take
 
 # Two normals that are closer than this (in length, about a degree) fade into one: so close, the direction at right
 # angles to both is lost, and its derivatives are large. At any sharper crease nothing of the fading is left.

@@ -16,7 +16,7 @@ import numpy as np
 
 import fitting
 import jaxsubdiv as js
-from fitting._memory import memory_of_fit
+from fitting.run.memory import memory_of_fit
 
 # Control vertices around the ring and around its tube; points; levels.
 CASES = (

@@ -22,24 +22,24 @@ from typing import Any
 from unittest.mock import patch
 
 PARTS = {
-    "closest points": ["fitting._look.closest_points"],
-    "weights, noise": ["fitting._look.measure"],
-    "derivatives": ["fitting._problem.differentiate", "fitting._problem.differentiate_distances"],
+    "closest points": ["fitting.model.pairing.closest_points"],
+    "weights, noise": ["fitting.model.pairing.measure"],
+    "derivatives": ["fitting.solve.problem.differentiate", "fitting.solve.problem.differentiate_distances"],
     "normal equations": [
-        "fitting._problem.equations_of_many",
-        "fitting._problem.normal_matrix",
-        "fitting._problem.times_transposed",
+        "fitting.solve.problem.equations_of_many",
+        "fitting.solve.problem.normal_matrix",
+        "fitting.solve.problem.times_transposed",
     ],
-    "factorisation": ["fitting._problem.factorise"],
-    "smoothness by the evidence": ["fitting._problem.next_precision", "fitting._problem.jacobian"],
-    "degrees of freedom": ["fitting._problem.Problem._count_determined"],
-    "new surface": ["fitting._fit._apply", "jaxsubdiv.refine", "fitting._fit.surface_moved"],
+    "factorisation": ["fitting.solve.problem.factorise"],
+    "smoothness by the evidence": ["fitting.solve.problem.next_precision", "fitting.solve.problem.jacobian"],
+    "degrees of freedom": ["fitting.solve.problem.Problem._count_determined"],
+    "new surface": ["fitting.run.fit._apply", "jaxsubdiv.refine", "fitting.run.fit.surface_moved"],
     "analysis, once a fit": [
-        "fitting._problem.Problem._analyse",
-        "fitting._problem.Problem.__init__",
-        "fitting._view.surroundings",
+        "fitting.solve.problem.Problem._analyse",
+        "fitting.solve.problem.Problem.__init__",
+        "fitting.model.view.surroundings",
     ],
-    "step and solution": ["fitting._problem.Problem.step"],
+    "step and solution": ["fitting.solve.problem.Problem.step"],
 }
 STAGES = {"jaxpr_trace": "traced", "jaxpr_to_mlir_module": "lowered", "backend_compile": "compiled"}
 

@@ -26,7 +26,7 @@ from trimesh import Trimesh
 
 import fitting
 import jaxsubdiv as js
-from fitting._picture import surface_distances
+from fitting.report.picture import surface_distances
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 NOISE = 3.0  # mm: what `jaxsubdiv-fit` moves the control mesh of its example by

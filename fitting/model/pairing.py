@@ -1,0 +1,169 @@
+"""What a sweep needs to know of the scan: pairs, their weights, and the noise that the distances show."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import KDTree
+
+import jaxsubdiv as js
+from jaxsubdiv import corner_weights
+from jaxsubdiv.linalg import dot, norm, unit
+
+from ..scan.closest_points import closest_points, nearest_rows
+from ..scan.outliers import NEIGHBOURS, is_dense, scattered_points
+from ..scan.scan import Scan
+from .residual import Pairs
+from .robust import AbstractLoss, noise_scale
+
+_BOUNDARY_SCALE = 1 / 3  # least scale of the loss at an open boundary, in control edges
+_ON_BOUNDARY = 1e-3  # how far, in parts of a face, a surface point may lie from a boundary and count as on it
+_NEIGHBOURS = 9
+_CLEAN = 0.9  # of the points crowded: so few outliers that neighbours can be trusted
+_STEEPEST = 0.5  # height over length: by how much the anatomy may turn away beyond a boundary
+_ON_SURFACE = 1e-6  # in control edges: a point that is closer is on the surface, in no direction from it
+_LEAST_COSINE = 0.5  # between a scan's normal and the surface's: beyond 60 degrees it is the other side of something
+
+
+class Look(NamedTuple):
+    """The scan as seen from one surface; lengths in mm."""
+
+    at: js.SurfacePoint
+    """The surface point closest to every scan point."""
+    pairs: Pairs
+    distances: Float[Array, "p"]
+    """Signed, positive outside."""
+    weights: Float[Array, "p"]
+    """Given weight times the robust one."""
+    precisions: Float[Array, "p"]
+    """1 / variance of every distance, in 1/mm^2, as far as the point counts."""
+    noise: Float[Array, ""]
+    """Standard deviation of the Gaussian part of the distances."""
+    scale: Float[Array, ""]
+    """Of the robust loss: the noise, or what the annealing keeps it at."""
+    rms: Float[Array, ""]
+    robust_rms: Float[Array, ""]
+
+
+class Surroundings(NamedTuple):
+    """What every scan point has around it."""
+
+    crowded: Bool[Array | np.ndarray, "p"]
+    """Whether other points are near, as they are not around scattered outliers."""
+    scattered: Bool[Array | np.ndarray, "p"]
+    """Whether it and the points near it lie in space, on no surface: it has no say."""
+    trusted: Bool[Array | np.ndarray, "p"]
+    """Whether what it has in common with its neighbours counts: in a scan of few scattered points, where crowded; not
+    in slices, which may be displaced as a whole."""
+    neighbours: Int[Array | np.ndarray, "p k"]
+    """Rows of the nearest points, without itself."""
+
+
+def surroundings(scan: Scan) -> Surroundings:
+    """The surroundings of a scan, which stay what they are while the surface moves."""
+    counted = np.flatnonzero(np.asarray(scan.weights_or_ones()) > 0)  # the others are as if they were not there
+    points = np.asarray(scan.points)[counted]
+    crowded, scattered = np.zeros((2, scan.n_points), bool)
+    neighbours = np.zeros((scan.n_points, min(_NEIGHBOURS, max(len(counted) - 1, 1))), np.int32)
+    if len(counted):
+        distances, rows = nearest_rows(KDTree(points), points, min(NEIGHBOURS + 1, len(points)))
+        crowded[counted] = is_dense(distances[:, -1])
+        scattered[counted] = scattered_points(points, crowded[counted])
+        if len(counted) > 1:
+            neighbours[counted] = counted[rows[:, 1 : _NEIGHBOURS + 1]]
+    clean = scan.slices is None and crowded.sum() > _CLEAN * len(counted)
+    return Surroundings(crowded, scattered, crowded & clean, neighbours)
+
+
+def look(
+    surface: js.RefinedSurface,
+    scan: Scan,
+    open_vertices: Bool[np.ndarray, "v"],
+    around: Surroundings,
+    edge: float,
+    loss: AbstractLoss,
+    floor: float,
+    held: Bool[np.ndarray, "v"] | None = None,
+) -> Look:
+    """Pair every scan point with the closest point of the surface, and weigh the pairs by how far apart they lie.
+
+    Args:
+        open_vertices: which vertices of the surface lie on a boundary.
+        around: of the scan's points, see `surroundings`.
+        edge: length of a control edge in mm.
+        loss: how a point loses weight with its distance.
+        floor: the least scale of the loss in mm.
+        held: vertices of the boundary that lie where they should: points beyond them do not count.
+    """
+    at = closest_points(surface, np.asarray(scan.points))
+    edge_and_floor = (jnp.asarray(value, scan.points.dtype) for value in (edge, floor))
+    return measure(surface, scan, at, open_vertices, around, *edge_and_floor, loss, held)
+
+
+@jax.jit
+def measure(
+    surface: js.RefinedSurface,
+    scan: Scan,
+    at: js.SurfacePoint,
+    open_vertices: Bool[Array | np.ndarray, "v"],
+    around: Surroundings,
+    edge: Float[Array, ""],
+    floor: Float[Array, ""],
+    loss: AbstractLoss,
+    held: Bool[Array | np.ndarray, "v"] | None = None,
+) -> Look:
+    on, normals = js.evaluate(surface, at)
+    away = scan.points - on
+    distance, spread = norm(away)[:, 0], scan.relative_deviations()
+    given = jnp.where(around.scattered, 0.0, scan.weights_or_ones())
+    corners, inside = corner_weights(surface, at)
+    at_boundary = on_boundary(open_vertices, corners, inside)
+    if scan.normals is not None:
+        cosine = dot(unit(scan.normals), normals)[:, 0]
+        # Files have normals of either side: the side that most points are on is outside.
+        given = jnp.where(cosine * jnp.sign(jnp.sum(cosine)) < _LEAST_COSINE, 0.0, given)
+    # Beyond a boundary the distance runs along the surface, and says nothing of the noise across it.
+    noise = noise_scale(distance / spread, jnp.where(at_boundary, 0.0, given))
+    scale = jnp.maximum(noise, floor)
+    # Near a boundary the surface may have to grow, by up to a control edge, to points that go on as it does: what is
+    # farther is not covered by the mesh, and outliers lie there in all directions.
+    at_its_scale = jnp.where(at_boundary, jnp.maximum(scale, edge * _BOUNDARY_SCALE), scale * spread)
+    signed = jnp.where(dot(normals, away)[:, 0] < 0, -distance, distance)
+    # What a point has in common with its neighbours is the surface's error, not the point's: a nose that the control
+    # mesh has yet to reach is no outlier. Where scattered points are many, they have neighbours of their own kind.
+    common = jnp.median(signed[around.neighbours], axis=1)
+    shared = around.trusted & (jnp.abs(common) < edge) & ~at_boundary
+    own = jnp.where(shared, jnp.minimum(distance, jnp.abs(signed - common)), distance)
+    weights = given * loss.weight(own / at_its_scale)
+    across = jnp.abs(dot(normals, away))[:, 0]
+    goes_on = around.crowded & (distance < edge) & (across < 3 * scale * spread + _STEEPEST * distance)
+    if held is not None:
+        goes_on &= ~on_boundary(held, corners, inside)
+    weights = jnp.where(at_boundary & ~goes_on, 0.0, weights)
+    # The derivative of a distance is along it: across the face, or from the edge or boundary that is closest.
+    directions = jnp.where(distance[:, None] > edge * _ON_SURFACE, unit(away), normals)
+    return Look(
+        at=at,
+        pairs=Pairs(scan.points, corners, inside, directions),
+        distances=signed,
+        weights=weights,
+        precisions=weights / jnp.mean(scan.weights_or_ones()) / (scale * spread) ** 2,
+        noise=noise,
+        scale=scale,
+        rms=_mean_root(distance, scan.weights_or_ones()),
+        robust_rms=_mean_root(distance, weights),
+    )
+
+
+def on_boundary(
+    boundary: Bool[Array | np.ndarray, "v"], corners: Int[Array, "p 4"], corner_weights: Float[Array, "p 4"]
+) -> Bool[Array, "p"]:
+    """Which surface points lie on the boundary, of whose vertices `boundary` is true."""
+    return jnp.sum(jnp.where(jnp.asarray(boundary)[corners], corner_weights, 0.0), axis=1) > 1 - _ON_BOUNDARY
+
+
+def _mean_root(distance: Float[Array, "p"], weights: Float[Array, "p"]) -> Float[Array, ""]:
+    total = jnp.sum(weights)
+    return jnp.sqrt(jnp.sum(weights * distance**2) / jnp.where(total > 0, total, 1.0))

@@ -1,0 +1,112 @@
+"""The picture of a fit: control mesh, surface with its error, convergence. matplotlib, so that no display is needed."""
+
+import io
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
+
+import jaxsubdiv as js
+
+from ..scan.closest_points import nearest_rows
+from .result import FitResult
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_COLOURS = "RdBu_r"  # red where the scan lies outside of the surface, blue inside, white where they meet
+_NEAREST = 8
+
+
+def draw_fit(result: FitResult, start: js.ControlMesh, *, title: str = "") -> "Figure":
+    """A figure of a fit: control mesh before and after, the surface, its distance from the scan, convergence.
+
+    Args:
+        result: the fit.
+        start: the control mesh where the fit started.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig("fit.png")`, or the last line of a notebook's cell.
+
+    Raises:
+        ImportError: matplotlib is missing; it comes with the extra `viz`.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError("pictures need matplotlib: pip install 'jaxsubdiv[viz]'") from error
+
+    class Picture(Figure):
+        """A figure that notebooks show where pyplot, which would tell them how, was never imported."""
+
+        def _repr_png_(self) -> bytes:
+            file = io.BytesIO()
+            self.savefig(file, format="png")
+            return file.getvalue()
+
+    figure = Picture(figsize=(15, 9.5), layout="constrained", dpi=100)
+    figure.suptitle(title, fontsize=14)
+    (before, after, smooth), (error, counts, convergence) = figure.subplots(2, 3)
+    view, surface = js.view_of(result.surface), result.surface
+    for ax, vertices, name in (
+        (before, start.vertices, "control mesh at the start, and the scan"),
+        (after, np.asarray(result.control.vertices), "control mesh fitted"),
+    ):
+        js.draw_surface(ax, js.ControlMesh(vertices, start.faces, check=False), view=view, edges=True)
+        ax.set_title(name)
+    points = result.points @ view.T
+    before.scatter(*points[:, :2].T, s=0.4, c="tab:blue", linewidths=0, zorder=3)
+    js.draw_surface(smooth, surface, view=view)
+    smooth.set_title(f"its surface, {surface.n_faces:,} faces")
+    _draw_error(error, result, view)
+    _draw_counts(counts, result)
+    _draw_convergence(convergence, result)
+    return figure
+
+
+def surface_distances(result: FitResult) -> Float[np.ndarray, "v"]:
+    """Signed distance of the scan at every vertex of the surface, in mm: the mean of the nearest points' distances.
+
+    NaN farther from the scan than its points are from one another, many times over: there is nothing to tell there.
+    """
+    points, vertices = result.points, np.asarray(result.surface.vertices)
+    tree = KDTree(points)
+    spacing = np.median(nearest_rows(tree, points, min(2, len(points)))[0][:, -1])
+    away, nearest = nearest_rows(tree, vertices, min(_NEAREST, len(points)))
+    known = away[:, 0] <= 5 * spacing + np.abs(result.distances)[nearest[:, 0]]
+    return np.where(known, result.distances[nearest].mean(axis=1), np.nan)
+
+
+def _draw_error(ax: Any, result: FitResult, view: Float[np.ndarray, "3 3"]) -> None:
+    limit = _limit(result, 98.0)
+    distances = surface_distances(result)
+    colours = js.draw_surface(ax, result.surface, view=view, values=distances, limits=(-limit, limit), cmap=_COLOURS)
+    ax.set_title("distance of the scan from it")
+    below = ax.inset_axes((0.1, -0.08, 0.8, 0.03))
+    bar = ax.figure.colorbar(colours, cax=below, orientation="horizontal")
+    bar.set_label("mm, outside is positive")
+
+
+def _limit(result: FitResult, percentile: float) -> float:
+    """A distance in mm that so many of the inliers stay within: outliers would bleach everything else."""
+    inliers = np.abs(result.distances[result.inliers])
+    return max(float(np.percentile(inliers, percentile)), 1e-6) if len(inliers) else 1.0
+
+
+def _draw_counts(ax: Any, result: FitResult) -> None:
+    limit = 1.2 * _limit(result, 100.0)
+    ax.hist(np.clip(result.distances, -limit, limit), bins=80, color="tab:blue")
+    ax.set_xlabel("signed distance, mm (the ends hold what is beyond)")
+    ax.set_ylabel("scan points")
+    ax.set_title(f"RMS {result.rms[-1]:.3f} mm, {np.mean(result.inliers):.0%} within 3 x the noise")
+    ax.grid(True, alpha=0.3)
+
+
+def _draw_convergence(ax: Any, result: FitResult) -> None:
+    ax.semilogy(result.robust_rms, marker="o", markersize=3, color="tab:blue")
+    ax.set_xlabel("sweep")
+    ax.set_ylabel("RMS distance by robust weights, mm")
+    ax.set_title("convergence")
+    ax.grid(True, which="both", alpha=0.3)

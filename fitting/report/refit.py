@@ -1,0 +1,162 @@
+"""The fit as a differentiable function of the scan, at the correspondences, weights and priors that it ended with."""
+
+from typing import NamedTuple, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+import jaxsubdiv as js
+
+from ..model.priors.symmetry import Mirror
+from ..model.residual import Pairs, Rows, Start, residuals
+from ..model.unknowns import Unknowns, apply_offset, no_offset
+from ..solve.elements import to_unknowns
+from .posterior import Posterior
+
+_MOST_STEPS = 40
+_RESTART, _MOST_RESTARTS = 60, 10  # of GMRES, in products with the Hessian
+_MOST_UNKNOWNS = 8000  # whose posterior is whitened, in 512 MB
+
+
+class _Fixed(NamedTuple):
+    """What does not depend on the scan."""
+
+    start: Start
+    pairs: Pairs
+    zero: Unknowns
+    shifts: Float[Array, "p 3"] | None
+    """Of every point, in mm, where slices were free to move."""
+    precisions: Float[Array, "p"]
+    prior_precisions: Rows
+    hold: Float[Array, "n"]
+    mirror: Mirror | None
+    whitening: Float[Array, "n u"]
+    """Takes unknowns of variance 1, as the posterior has them, to offsets."""
+    left: Float[Array, "u"]
+    """Slope of the cost where the fit ended, which the solution keeps: not all of a surface comes to rest."""
+
+
+@final
+class Refit(eqx.Module):
+    """Solves a fit again for other points or weights, differentiably, by optimistix and its implicit adjoint.
+
+    Get it from a fit: `refit = result.refit()`. Then `refit(points)` is a smooth function for `jax.grad`, `jax.jvp`,
+    `jax.jit` and `jax.vmap`: the control that the fit would find from these points if every point kept its surface
+    point, its direction and its robust weight, and if the noise, the strength of the priors, the plane of symmetry and
+    the shifts of slices stayed what they were.
+
+    From the scan's own points it is the fit's own control: where the fit was not quite at rest, the slope of the cost
+    that it left stays. The derivative is that of the solution, not of the steps to it: of the volume of a fitted organ,
+    say, by each of the scan points that it came from. Control vertices that turned back from sweep to sweep, as where
+    they cannot follow an ear, are held a little: they slip less along the surface than they would.
+    """
+
+    _fixed: _Fixed
+
+    def __call__(
+        self, points: Float[Array, "p 3"], weights: Float[Array, "p"] | None = None
+    ) -> tuple[js.AbstractScheme, js.Control]:
+        """Scheme with its h, and control, fitted to `points`.
+
+        Args:
+            points: as many as the scan has, in mm, each near the one of the scan in its row.
+            weights: factors of the weights that the points had in the fit; default: 1 each.
+
+        Raises:
+            ValueError: another number of points than the scan has.
+            EquinoxRuntimeError: the solve does not converge: the points are too far from the scan's.
+        """
+        fixed = self._fixed
+        if points.shape != fixed.pairs.points.shape:
+            raise ValueError(f"the fit had points {list(fixed.pairs.points.shape)}; got {list(points.shape)}.")
+        dtype = fixed.whitening.dtype
+        points = jnp.asarray(points, dtype)
+        weights = jnp.ones_like(points[:, 0]) if weights is None else jnp.asarray(weights, dtype)
+        of_solution, of_derivative = _tolerances(points)
+        found = optx.root_find(
+            _slope,
+            optx.Newton(rtol=0.0, atol=of_solution, linear_solver=_linear(of_solution / 10)),
+            jnp.zeros(fixed.whitening.shape[1], dtype),
+            args=(points, weights, fixed),
+            adjoint=optx.ImplicitAdjoint(linear_solver=_linear(of_derivative)),
+            max_steps=_MOST_STEPS,
+        )
+        offset, start = to_unknowns(fixed.whitening @ found.value, fixed.zero), fixed.start
+        return apply_offset(start.topology, start.scheme, start.control, offset)
+
+
+def _slope(z: Float[Array, "u"], args: tuple[Array, Array, _Fixed]) -> Float[Array, "u"]:
+    return jax.grad(_cost)(z, *args) - args[-1].left
+
+
+def _linear(tolerance: float) -> lx.AbstractLinearSolver:
+    # In whitened unknowns the Hessian is nearly the identity, but for the curvature that the posterior leaves out: that
+    # is several times as much where residuals are large.
+    return lx.GMRES(rtol=tolerance, atol=tolerance, restart=_RESTART, max_steps=_MOST_RESTARTS)
+
+
+def _tolerances(points: Float[Array, "p 3"]) -> tuple[float, float]:
+    """Of the solution, in posterior standard deviations, and, as a part, of its derivative."""
+    eps = float(jnp.finfo(points.dtype).eps)
+    return max(1e-8, 3e5 * eps), max(1e-8, 1e3 * eps)
+
+
+def _cost(
+    z: Float[Array, "u"], points: Float[Array, "p 3"], weights: Float[Array, "p"], fixed: _Fixed
+) -> Float[Array, ""]:
+    vector = fixed.whitening @ z
+    offset, start = to_unknowns(vector, fixed.zero), fixed.start
+    points = points if fixed.shifts is None else points + fixed.shifts
+    rows = residuals(offset, start, fixed.pairs._replace(points=points))
+    precisions = fixed.prior_precisions._replace(distance=fixed.precisions * weights)
+    terms = [jnp.sum(precision * row**2) for precision, row in zip(precisions, rows, strict=True)]
+    if fixed.mirror is not None:
+        _, control = apply_offset(start.topology, start.scheme, start.control, offset)
+        terms.append(jnp.sum(fixed.mirror.rows(control, jnp) ** 2))
+    return 0.5 * (jnp.sum(jnp.stack(terms)) + jnp.sum(fixed.hold * vector**2))
+
+
+def make_refit(posterior: Posterior) -> Refit:
+    """The differentiable fit about a posterior.
+
+    Raises:
+        ValueError: there are too many unknowns to whiten.
+    """
+    problem, dtype = posterior.problem, posterior.control.vertices.dtype
+    n, free = problem.elements.n, problem.is_free
+    if free.sum() > _MOST_UNKNOWNS:
+        raise ValueError(
+            f"the fit has {free.sum()} unknowns; its derivative is for up to {_MOST_UNKNOWNS}. "
+            "Fit a coarser control mesh."
+        )
+    whitening = np.zeros((n, int(free.sum())))
+    conditional = posterior.matrix.toarray()[: posterior.n_free, : posterior.n_free]  # given the shifts
+    # Where control vertices turned back from sweep to sweep the cost need not be convex, unless they are held.
+    hold = problem.last_hold
+    conditional += np.diag((hold - problem.loose)[free])
+    whitening[free] = np.linalg.inv(np.linalg.cholesky(conditional)).T
+
+    def on_device(values: object) -> Array:
+        return jnp.asarray(values, dtype)
+
+    mirror = problem.mirror(posterior.control)
+    fixed = _Fixed(
+        start=problem.start(posterior.scheme, posterior.control),
+        pairs=posterior.seen.pairs,
+        zero=no_offset(problem.free, posterior.scheme, posterior.control),
+        shifts=None if posterior.shifts is None else on_device(posterior.shifts.of_points()),
+        precisions=on_device(problem.distance_precisions(posterior.seen)),
+        prior_precisions=Rows(*map(on_device, problem.prior_precisions())),
+        hold=on_device(hold),
+        mirror=jax.tree.map(lambda a: on_device(a) if a.dtype.kind == "f" else a, mirror),
+        whitening=on_device(whitening),
+        left=jnp.zeros(whitening.shape[1], dtype),
+    )
+    points = fixed.pairs.points if fixed.shifts is None else fixed.pairs.points - fixed.shifts  # the scan's own
+    left = jax.jit(jax.grad(_cost))(fixed.left, points, jnp.ones_like(points[:, 0]), fixed)
+    return Refit(fixed._replace(left=left))

@@ -1,0 +1,242 @@
+"""What a fit returns."""
+
+import functools
+import os
+import warnings
+from typing import final
+
+import numpy as np
+import optimistix as optx
+from jaxtyping import Bool, Float
+
+import jaxsubdiv as js
+
+from ..model.pairing import Look
+from ..model.priors.shifts import Shifts
+from ..model.recipe import Recipe
+from ..model.view import View
+from ..scan.scan import Scan
+from ..solve.problem import Problem
+from .coverage import distances_to_scan, vertex_areas, weighted_quantile, worst_places
+from .posterior import Posterior, Uncertainty
+from .refit import Refit, make_refit
+from .report import Report, SliceShift, WorstPlace
+
+
+@final
+class FitResult:
+    """A control mesh fitted to a scan, and how well it fits.
+
+    Attributes:
+        control: fitted control vertices (mm) and unit normals.
+        scheme: the scheme with its fitted h.
+        surface: the refined surface of both.
+        scan: the scan that was fitted.
+        at: the surface point closest to every scan point.
+        distances: signed distance of every scan point from the surface in mm, positive outside.
+        weights: how much every point counts at the end: its own weight times the robust one.
+        inliers: points within three times the noise.
+        rms: root mean square distance of the scan points to the surface in mm: at the start, then after every sweep.
+        robust_rms: the same with every point by its robust weight, so that outliers do not hide the rest.
+        noise: standard deviation in mm of the Gaussian part of the distances: the noise of the scan, and the detail
+            that the control mesh is too coarse for.
+        result: `optimistix.RESULTS.successful`, or why the fit stopped without having converged.
+        likeness: how much of the shape where the fit started was expected of the surface, see `Priors.likeness`; of a
+            mesh that was split, as a mean over the surface.
+        recipe: the settings that the fit was given, to fit the next scan in the same way.
+        start: the control where the fit started, with the normals that it took.
+        shifts: how far each slice of the scan was shifted, in mm; no row where none was free to move.
+        slices: the number, in `Scan.slices`, of the slice of each row of `shifts`. Slices without a plane have no row.
+        points: the scan's points with these shifts put on: where the distances are measured from.
+    """
+
+    def __init__(
+        self,
+        *,
+        control: js.Control,
+        scheme: js.AbstractScheme,
+        surface: js.RefinedSurface,
+        scan: Scan,
+        rms: Float[np.ndarray, "sweeps"],
+        robust_rms: Float[np.ndarray, "sweeps"],
+        result: optx.RESULTS,
+        problem: Problem,
+        seen: Look,
+        recipe: Recipe | None = None,
+        start: js.Control | None = None,
+        shifts: Shifts | None = None,
+    ):
+        self.control = control
+        self.scheme = scheme
+        self.surface = surface
+        self.scan = scan
+        self.at = seen.at
+        self.distances = np.asarray(seen.distances)
+        self.weights = np.asarray(seen.weights)
+        self.rms = rms
+        self.robust_rms = robust_rms
+        self.noise = float(seen.noise)
+        self.result = result
+        self.recipe = recipe
+        self.start = start
+        self.likeness = problem.likeness_of_all
+        self.shifts = np.zeros((0, 3)) if shifts is None else shifts.vectors
+        self.slices = np.zeros(0, int) if shifts is None else shifts.slices
+        self._problem, self._seen, self._shifts = problem, seen, shifts
+
+    @functools.cached_property
+    def posterior(self) -> Posterior:
+        """The surfaces that scan and priors leave probable; made when it is first asked for."""
+        return Posterior(self._problem, self.scheme, self.control, self._seen, self._shifts)
+
+    def uncertainty(self) -> Uncertainty:
+        """Standard deviations of the control vertices and of the surface's vertices, across the surface, in mm.
+
+        They say how far the surface may be off the anatomy because of noise, holes and few points, and because the
+        control mesh is too coarse for it (see `Uncertainty.misfit`): where points of one control face lie off the
+        surface together. Errors that neighbouring points share, as those of one contour, count as such a misfit. Shifts
+        of slices count as unknown. Exact for up to 4,000 unknowns, else from random draws.
+        """
+        return self._uncertainty
+
+    @functools.cached_property
+    def _uncertainty(self) -> Uncertainty:
+        return self.posterior.uncertainty()
+
+    @functools.cached_property
+    def control_mesh(self) -> js.ControlMesh:
+        """The fitted control mesh with its normals, for `js.write_mesh`."""
+        return js.ControlMesh(
+            self.control.vertices, self._problem.topology.control_faces, self.control.normals, check=False
+        )
+
+    def refit(self) -> Refit:
+        """The fitted control as a differentiable function of scan points and weights; see `Refit`.
+
+        Shifts of slices are held at what the fit found.
+
+        Warns:
+            UserWarning: the fit did not converge: the derivative is that of where it stopped.
+        """
+        if self.result != optx.RESULTS.successful:
+            warnings.warn(
+                "the fit did not converge: what depends on the scan here is the surface where it stopped, not the best "
+                "one. Give more `max_sweeps`.",
+                stacklevel=2,
+            )
+        return make_refit(self.posterior)
+
+    def on(self, scan: Scan) -> "FitResult":
+        """The same surface, measured by another scan: by all points of the one of which a part was fitted, say.
+
+        Correspondences, distances, noise, report and uncertainty are those of its points; the convergence is that of
+        the fit. Slices keep the shifts that the fit found for their numbers. The misfit in the uncertainty is somewhat
+        too large where the points were not those of the fit.
+
+        Raises:
+            ValueError: the fit does not know its settings.
+        """
+        if self.recipe is None:
+            raise ValueError("this fit does not know its settings: only what `fit` returned can be measured again.")
+        edge = float(js.edge_length(self._problem.topology, self.control.vertices))
+        shifts = None if self._shifts is None or scan.slices is None else self._shifts.of(scan)
+        seen = View(scan, self.surface, edge, self.recipe.loss, self._problem.curve).seen_from(
+            self.surface, 0.0, shifts
+        )
+        return FitResult(
+            control=self.control,
+            scheme=self.scheme,
+            surface=self.surface,
+            scan=scan,
+            rms=np.append(self.rms[:-1], float(seen.rms)),
+            robust_rms=np.append(self.robust_rms[:-1], float(seen.robust_rms)),
+            result=self.result,
+            problem=self._problem,
+            seen=seen,
+            recipe=self.recipe,
+            start=self.start,
+            shifts=shifts,
+        )
+
+    def save(self, folder: str | os.PathLike[str]) -> None:
+        """Write the fit into a folder, made where there is none, for `fitting.load`; and its settings.
+
+        Of the two files `fit.npz` holds everything, scan and control mesh included, and `recipe.json` the settings, for
+        `fitting.load_recipe` and for people. Each is complete or not there.
+
+        Raises:
+            OSError: the folder cannot be made or written.
+            ValueError: the scheme or the loss is of a class of your own, or the control mesh has creases.
+        """
+        from .saved import save  # which makes results itself
+
+        save(folder, self)
+
+    @property
+    def points(self) -> Float[np.ndarray, "p 3"]:
+        """The scan's points, moved by the shifts of their slices, in mm."""
+        return np.asarray(self._seen.pairs.points)
+
+    @property
+    def inliers(self) -> Bool[np.ndarray, "p"]:
+        return np.abs(self.distances) <= 3 * self.noise
+
+    def report(self, *, uncertainty: bool = False) -> Report:
+        """The fit in numbers: `print` it, or take `.as_dict()`.
+
+        Args:
+            uncertainty: with that of the surface, which takes a second or more.
+        """
+        areas, to_scan = vertex_areas(self.surface), distances_to_scan(self.surface, self._seen, self.inliers)
+        covered = ~np.isnan(to_scan)
+        areas_there, away = areas[covered], np.abs(to_scan[covered])
+        known, share = bool(areas_there.sum() > 0), areas_there / max(areas_there.sum(), np.finfo(float).tiny)
+        spread = self.uncertainty().surface[covered] if uncertainty and known else None
+        edge = float(js.edge_length(self._problem.topology, self.control.vertices))
+        return Report(
+            converged=bool(self.result == optx.RESULTS.successful),
+            reason=_words(self.result),
+            sweeps=len(self.rms) - 1,
+            rms_start=float(self.rms[0]),
+            rms=float(self.rms[-1]),
+            mean=float(np.mean(np.abs(self.distances))),
+            median=float(np.median(np.abs(self.distances))),
+            percentile_95=float(np.percentile(np.abs(self.distances), 95)),
+            maximum=float(np.max(np.abs(self.distances))),
+            bias=float(np.mean(self.distances)),
+            n_points=self.scan.n_points,
+            noise=self.noise,
+            inlier_share=float(np.mean(self.inliers)),
+            rms_inliers=_rms(self.distances[self.inliers]),
+            n_control_vertices=self.control.vertices.shape[0],
+            n_faces=self.surface.n_faces,
+            h=None if self.scheme.h is None else np.asarray(self.scheme.h).tolist(),
+            likeness=self.likeness,
+            rms_per_sweep=[float(value) for value in self.rms],
+            coverage=float(areas_there.sum() / areas.sum()),
+            mean_to_scan=float(share @ away) if known else None,
+            rms_to_scan=float(np.sqrt(share @ away**2)) if known else None,
+            percentile_95_to_scan=weighted_quantile(away, share, 0.95) if known else None,
+            maximum_to_scan=float(away.max()) if known else None,
+            n_unknowns=int(self._problem.is_free.sum()) + 2 * len(self.slices),
+            determined=self._problem.determined,
+            least_margin=float(js.admissible_margin(self.control_mesh).min()) if self.scheme.uses_normals else None,
+            uncertainty_median=None if spread is None else weighted_quantile(spread, share, 0.5),
+            uncertainty_95=None if spread is None else weighted_quantile(spread, share, 0.95),
+            shifts=[SliceShift(int(i), shift.tolist()) for i, shift in zip(self.slices, self.shifts, strict=True)],
+            worst=[
+                WorstPlace(place.position.tolist(), place.distance, place.n_points)
+                for place in worst_places(self.surface, self._seen, self.distances, edge)
+            ],
+        )
+
+
+def _rms(distances: Float[np.ndarray, "p"]) -> float:
+    return float(np.sqrt(np.mean(distances**2))) if len(distances) else 0.0
+
+
+def _words(result: optx.RESULTS) -> str:
+    """Why the fit stopped, in words; optimistix's own where they are not about its inner steps."""
+    if result == optx.RESULTS.nonlinear_max_steps_reached:
+        return "max_sweeps reached before the distances came to rest"
+    return str(optx.RESULTS[result])

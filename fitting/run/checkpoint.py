@@ -1,0 +1,76 @@
+"""The state of a run in a file, from which the same run goes on where it was stopped."""
+
+import hashlib
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import jaxsubdiv as js
+from jaxsubdiv.files import replacing
+
+_INPUT = "input "  # before the name of an input, in the file
+
+
+class Checkpoint:
+    """A file of arrays that belongs to a run of certain inputs, and to no other."""
+
+    def __init__(self, path: str | os.PathLike[str], inputs: Mapping[str, Any]):
+        """
+        Args:
+            path: the file, an .npz; its folder is made when it is first written.
+            inputs: all that the run depends on by name, as pytrees of arrays, numbers and words.
+        """
+        self.path = Path(path)
+        self._marks = {name: _mark(value) for name, value in inputs.items()} | {"release": js.__version__}
+
+    def read(self) -> dict[str, np.ndarray] | None:
+        """The arrays last written; None where there is no file.
+
+        Raises:
+            ValueError: the file cannot be read, or is of a run of other inputs; the text names them.
+        """
+        if not self.path.is_file():
+            return None
+        try:
+            with open(self.path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
+                arrays = dict(file)
+        except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{self.path} is no checkpoint: {error}. Delete it to start anew.") from None
+        marks = {name.removeprefix(_INPUT): str(arrays.pop(name)) for name in list(arrays) if name.startswith(_INPUT)}
+        others = [name for name in sorted(marks.keys() | self._marks) if marks.get(name) != self._marks.get(name)]
+        if others:
+            raise ValueError(
+                f"{self.path} is of another fit, with another {', another '.join(others)}. Start with what it was "
+                "started with to go on, give another folder, or delete the file to start anew."
+            )
+        return arrays
+
+    def write(self, arrays: Mapping[str, Any]) -> None:
+        """Take the place of what was written before; None is left out."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        whole = {name: np.asarray(value) for name, value in arrays.items() if value is not None}
+        whole |= {_INPUT + name: np.asarray(mark) for name, mark in self._marks.items()}
+        with replacing(self.path) as path, open(path, "wb") as file:
+            np.savez(file, **whole)  # pyright: ignore[reportArgumentType]
+
+    def remove(self) -> None:
+        """The run has ended, or is to be forgotten."""
+        self.path.unlink(missing_ok=True)
+
+
+def _mark(value: Any) -> str:
+    """What tells a value from others: of its arrays every bit, and of the rest the words."""
+    leaves, structure = jax.tree.flatten(value)
+    found = hashlib.sha256(str(structure).encode())
+    for leaf in leaves:
+        if isinstance(leaf, (jax.Array, np.ndarray, np.generic)):
+            array = np.asarray(leaf)
+            found.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+        else:
+            found.update(repr(leaf).encode())
+    return found.hexdigest()

@@ -1,0 +1,155 @@
+"""The scan: measured points, and what is known of each."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+import jaxsubdiv as js
+from jaxsubdiv import read_texts, strong_float
+from jaxsubdiv.errors import name_rows
+
+_LABELS, _SLICE = ("label", "contour"), "slice"
+
+
+class ScanError(ValueError):
+    """A scan cannot be fitted as it is; the text names the rows and what to do."""
+
+
+def _optional(value: object) -> Array | None:
+    return None if value is None else strong_float(value)
+
+
+def _optional_whole(value: object) -> Array | None:
+    if value is None:
+        return None
+    values = np.asarray(value)
+    if values.dtype.kind not in "iuf" or not np.all(np.isfinite(values) & (values == np.round(values))):
+        raise ScanError("`slices` must be whole numbers, one a point: number the slices.")
+    return jnp.asarray(values, jnp.int32)
+
+
+class Scan(eqx.Module):
+    """Measured points of a surface.
+
+    Attributes:
+        points: positions in mm.
+        normals: outward normals of any length, or None.
+        weights: how much each point counts, not negative, or None where all count alike.
+        deviations: standard deviation of each point's distance, positive, or None where all are alike. Only their ratio
+            counts: how large the noise is, the fit finds out.
+        slices: the number of the slice that each point lies in, or None where the scan is not made of slices. `fit`
+            shifts each within its plane.
+
+    Raises:
+        ScanError: there is no point, a value is not finite, a weight is negative, a deviation is not positive, a
+            slice has no whole number, or lengths differ.
+    """
+
+    points: Float[Array, "p 3"] = eqx.field(converter=strong_float)
+    normals: Float[Array, "p 3"] | None = eqx.field(converter=_optional, default=None)
+    weights: Float[Array, "p"] | None = eqx.field(converter=_optional, default=None)
+    deviations: Float[Array, "p"] | None = eqx.field(converter=_optional, default=None)
+    slices: Int[Array, "p"] | None = eqx.field(converter=_optional_whole, default=None)
+
+    def __check_init__(self):
+        if self.points.ndim != 2 or self.points.shape[-1] != 3 or len(self.points) == 0:
+            raise ScanError(f"a scan needs points of the shape [p, 3], at least one; got {list(self.points.shape)}.")
+        for name, values, shape in (
+            ("points", self.points, self.points.shape),
+            ("normals", self.normals, self.points.shape),
+            ("weights", self.weights, self.points.shape[:1]),
+            ("deviations", self.deviations, self.points.shape[:1]),
+            ("slices", self.slices, self.points.shape[:1]),
+        ):
+            if values is None:
+                continue
+            if values.shape != shape:
+                raise ScanError(f"`{name}` must have the shape {list(shape)}; got {list(values.shape)}.")
+            finite = np.isfinite(np.asarray(values)).reshape(len(values), -1).all(axis=1)
+            if not finite.all():
+                raise ScanError(f"`{name}` are not finite in rows {name_rows(np.flatnonzero(~finite))}. Drop the rows.")
+        if self.weights is not None:
+            negative = np.flatnonzero(np.asarray(self.weights) < 0)
+            if len(negative):
+                raise ScanError(f"`weights` are negative in rows {name_rows(negative)}. Give 0 to ignore a point.")
+            if not float(self.weights.sum()) > 0:
+                raise ScanError("all `weights` are 0: nothing is left to fit. Give None where all points count alike.")
+
+        if self.deviations is not None:
+            bad = np.flatnonzero(np.asarray(self.deviations) <= 0)
+            if len(bad):
+                raise ScanError(
+                    f"`deviations` are not positive in rows {name_rows(bad)}. Give a weight of 0 to ignore a point."
+                )
+
+    @property
+    def n_points(self) -> int:
+        """Number of points."""
+        return self.points.shape[0]
+
+    def weights_or_ones(self) -> Float[Array, "p"]:
+        """The weights, 1 each where there are none."""
+        return jnp.ones_like(self.points[:, 0]) if self.weights is None else self.weights
+
+    def drawn(self, n: int) -> "Scan":
+        """At most `n` of the points, drawn at random, always the same."""
+        if n >= self.n_points:
+            return self
+        rows = np.sort(np.random.default_rng(0).choice(self.n_points, n, replace=False))
+        return Scan(**{name: None if value is None else value[rows] for name, value in vars(self).items()})
+
+    def without_slices(self) -> "Scan":
+        """The same points, each for itself."""
+        return Scan(self.points, self.normals, self.weights, self.deviations)
+
+    def relative_deviations(self) -> Float[Array, "p"]:
+        """The deviations over their root mean square, 1 each where there are none."""
+        if self.deviations is None:
+            return jnp.ones_like(self.points[:, 0])
+        return self.deviations / jnp.sqrt(jnp.mean(self.deviations**2))
+
+
+def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[str] = ()) -> Scan:
+    """A scan from a file of points: PLY, XYZ, CSV, TXT, NPZ, VTP, or any mesh file, whose vertices are then the points.
+
+    A column `slice` of a CSV file, or another table with a header row, numbers the slices.
+
+    Args:
+        path: the file.
+        scale: multiplies the coordinates. A file of points does not say its unit; 1000 takes metres to mm.
+        labels: only the rows of a table whose column `label` or `contour` holds one of these texts, in capitals or not.
+
+    Raises:
+        MeshError: the file cannot be read; the text names the file and the line.
+        ScanError: it holds no points, or none of these labels, and the text lists those that there are; or a slice has
+            no whole number.
+    """
+    path, cloud = Path(path), js.read_points(path, scale=scale)
+    columns = read_texts(path, (*_LABELS, _SLICE))
+    slices = None if _SLICE not in columns else _numbers(path, columns[_SLICE])
+    words = [labels] if isinstance(labels, str) else list(labels)
+    if not words:
+        return Scan(*cloud, slices=slices)
+    of_rows = next((columns[name] for name in _LABELS if name in columns), [])
+    chosen = np.array([any(word.casefold() in one.casefold() for word in words) for one in of_rows], bool)
+    if not chosen.any():
+        there = ", ".join(sorted(set(of_rows))) or "no column `label` or `contour`"
+        wanted = " or ".join(f"'{word}'" for word in words)
+        raise ScanError(f"{path.name}: no row has a label that holds {wanted}. It has: {there}.")
+    kept = (None if rows is None else rows[chosen] for rows in (*cloud, None, slices))
+    return Scan(*kept)
+
+
+def _numbers(path: Path, texts: list[str]) -> Int[np.ndarray, "p"]:
+    try:
+        return np.array([int(text) for text in texts])
+    except ValueError:
+        bad = next(text for text in texts if not text.lstrip("+-").isdecimal())
+        raise ScanError(
+            f"{path.name}: the column `{_SLICE}` has '{bad[:40]}', which is no whole number. Number the slices, or "
+            "rename the column where it is something else."
+        ) from None

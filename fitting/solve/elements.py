@@ -1,0 +1,384 @@
+"""Normal equations of a fit, assembled as in finite elements: a control face is an element.
+
+The surface over a control face depends on few control vertices: its own, and those of the faces around it. All
+derivatives of all rows are therefore found by few forward derivatives, each along many control vertices at once that
+have no face in common (Curtis, Powell and Reid, On the estimation of sparse Jacobian matrices, 1974), and the normal
+equations are sums of small dense matrices, one a face. Which vertices belong to which face is analysed once.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Array, Float, Int, Shaped
+
+import jaxsubdiv as js
+
+from ..model.residual import Pairs, Rows, Start, signed_distances, surface_and_priors
+from ..model.unknowns import Free, Unknowns, no_offset
+
+_ROWS_A_BLOCK = 24
+_PAIRS_AT_ONCE = 65_536  # bounds the memory to a few hundred MB, however large the scan is
+_ENTRIES_AT_ONCE = 1 << 22  # of the faces' matrices, likewise
+_ONE_THREAD = 1 << 18  # multiplications of a product that OpenBLAS leaves to one
+_WRONG = 1e-3  # of a derivative: far more than rounding in float32, far less than a forgotten control vertex
+
+
+class Run(NamedTuple):
+    """Faces whose matrices are summed up at once, and where these go."""
+
+    faces: slice
+    source: Int[np.ndarray, "e"]
+    """Entries of the faces' matrices, one after the other, that lie in the lower triangle; equal places together."""
+    first: Int[np.ndarray, "k"]
+    """Where in `source` each place begins."""
+    place: Int[np.ndarray, "k"]
+    """Among the places of the lower triangle of all."""
+
+
+class Elements(NamedTuple):
+    """Which unknowns the rows of each control face depend on. Unknowns are numbered vertex by vertex, then h."""
+
+    columns: Int[np.ndarray, "f d"]
+    """Unknowns of every face; `n` where there are fewer than in other faces."""
+    seeds_of: Int[np.ndarray, "f d"]
+    """The seed that each of them moves in."""
+    seeds: Unknowns
+    """Directions, one a leading row: many unknowns at once, no two of them in one face. The last is at random."""
+    pattern: sp.csc_array
+    """Of the normal equations, which are symmetric; its values are the place of each entry in the lower triangle."""
+    runs: list[Run]
+    n: int
+    """Number of unknowns."""
+
+
+class Patches(NamedTuple):
+    """The part of the surface that belongs to each control face."""
+
+    owner: Int[np.ndarray, "g"]
+    """The control face of every face of the surface."""
+    vertices: Int[np.ndarray, "f w"]
+    """The vertices of each patch; 0 where there are fewer than in others."""
+    slots: Int[np.ndarray, "g 4"]
+    """Where in its patch each corner of a face of the surface stands; corners as `corner_weights` has them."""
+
+
+class Derivatives(NamedTuple):
+    """Values at the start of a sweep, and their derivatives by the unknowns of the control faces that they lie in."""
+
+    surface: Float[Array, "v 3"]
+    rows: Rows
+    """Of the priors."""
+    by_rows: Float[Array, "m d"]
+    by_surface: Float[Array, "f w d 3"]
+    """Of the vertices of the patches."""
+    along: tuple[Float[Array, "v 3"], Float[Array, "m"]]
+    """Of all vertices, and of the rows, along the last seed."""
+
+
+def find_patches(surface: js.RefinedSurface, owner: Int[np.ndarray, "g"], n_control_faces: int) -> Patches:
+    """The patches of a surface, from the control face of each of its faces."""
+    triangles, quads = (np.asarray(surface.faces[size]) for size in (3, 4))
+    corners = np.concatenate([np.concatenate([triangles, triangles[:, 2:]], axis=1), quads])
+    n = surface.vertices.shape[0]
+    keys, place = np.unique(owner[:, None].astype(np.int64) * n + corners, return_inverse=True)
+    of_key = keys // n
+    counts = np.bincount(of_key, minlength=n_control_faces)
+    slot = np.arange(len(keys)) - (np.cumsum(counts) - counts)[of_key]
+    vertices = np.zeros((n_control_faces, counts.max()), np.int32)
+    vertices[of_key, slot] = keys % n
+    return Patches(owner, vertices, slot[place].reshape(corners.shape).astype(np.int32))
+
+
+def find_elements(topology: js.Topology, free: Free, start: Start, rings: int) -> Elements:
+    """Analyse which unknowns belong together, if a face depends on the vertices of `rings` rings of faces around it."""
+    n_vertices = topology.n_control_vertices
+    near = _vertices_near_faces(topology, rings)
+    colour = _colour(near)
+    zero = no_offset(free, start.scheme, start.control)
+    per_vertex = sum(part.shape[1] for part in (zero.vertices, zero.normals) if part is not None)
+    n_h = 0 if zero.h is None else zero.h.size
+    n = n_vertices * per_vertex + n_h
+    n_colours = int(colour.max()) + 1
+
+    counts, n_faces = np.diff(near.indptr), len(near.indptr) - 1
+    slot = np.arange(near.indptr[-1]) - np.repeat(near.indptr[:-1], counts)
+    vertices = np.full((n_faces, counts.max()), -1)
+    vertices[np.repeat(np.arange(n_faces), counts), slot] = near.indices
+    there = vertices >= 0
+    components = np.arange(per_vertex)
+    columns = np.where(there[..., None], vertices[..., None] * per_vertex + components, n)
+    seeds_of = np.where(there[..., None], colour[vertices][..., None] * per_vertex + components, 0)
+    last = np.arange(n_h)
+    columns, seeds_of = (
+        np.concatenate([table.reshape(len(vertices), -1), np.tile(tail, (len(vertices), 1))], axis=1)
+        for table, tail in ((columns, n_vertices * per_vertex + last), (seeds_of, n_colours * per_vertex + last))
+    )
+    seeds = np.zeros((n_colours * per_vertex + n_h + 1, n))
+    rows = np.arange(n_vertices * per_vertex)
+    seeds[colour[rows // per_vertex] * per_vertex + rows % per_vertex, rows] = 1
+    seeds[n_colours * per_vertex + last, n_vertices * per_vertex + last] = 1
+    seeds[-1] = np.random.default_rng(0).normal(size=n)
+    pattern, runs = _pattern(columns, n)
+    directions = jax.vmap(lambda row: to_unknowns(row, zero))(jnp.asarray(seeds))
+    return Elements(columns, seeds_of, directions, pattern, runs, n)
+
+
+def to_unknowns(row: Float[Array, "n"], like: Unknowns) -> Unknowns:
+    """A vector of all unknowns, vertex by vertex and then h, as offsets."""
+    parts = [part for part in (like.vertices, like.normals) if part is not None]
+    n_vertices = parts[0].shape[0] if parts else 0
+    width = sum(part.shape[1] for part in parts)
+    table = row[: n_vertices * width].reshape(n_vertices, width)
+    n_first = 0 if like.vertices is None else 3
+    h = None if like.h is None else row[n_vertices * width :].reshape(like.h.shape).astype(like.h.dtype)
+    dtype = parts[0].dtype if parts else None
+    return Unknowns(
+        None if like.vertices is None else table[:, :n_first].astype(dtype),
+        None if like.normals is None else table[:, n_first:].astype(dtype),
+        h,
+    )
+
+
+@eqx.filter_jit
+def differentiate(
+    zero: Unknowns,
+    start: Start,
+    seeds: Unknowns,
+    seeds_of: Int[Array | np.ndarray, "f d"],
+    row_faces: Int[Array | np.ndarray, "m"],
+    patches: Int[Array | np.ndarray, "f w"],
+) -> Derivatives:
+    """The surface and the rows of the priors at the start of a sweep, and their derivatives.
+
+    Args:
+        seeds: see `Elements`; so is `seeds_of`.
+        row_faces: the control face of every row.
+        patches: the vertices of the surface over every control face.
+    """
+    (surface, rows), derivative = jax.linearize(lambda offset: surface_and_priors(offset, start), zero)
+
+    def along(seed: Unknowns) -> tuple[Array, Array]:
+        by_surface, by_rows = derivative(seed)
+        return by_surface, jnp.concatenate(by_rows)
+
+    of_surface, of_rows = jax.lax.map(along, seeds)
+    by_rows = jnp.take_along_axis(of_rows.T, seeds_of[row_faces], axis=1)
+    by_surface = of_surface[seeds_of[:, None, :], patches[:, :, None]]
+    return Derivatives(surface, rows, by_rows, by_surface, (of_surface[-1], of_rows[-1]))
+
+
+@jax.jit
+def differentiate_distances(
+    found: Derivatives, pairs: Pairs, face: Int[Array | np.ndarray, "p"], slots: Int[Array | np.ndarray, "p 4"]
+) -> tuple[Float[Array, "p"], Float[Array, "p d"]]:
+    """Distances from the surface, and their derivatives.
+
+    Args:
+        face: the control face of each pair.
+        slots: where in its patch each of the corners stands.
+    """
+    factors = pairs.corner_weights[:, :, None] * pairs.directions[:, None, :]
+    a, b, c, d = (jnp.einsum("pdx,px->pd", found.by_surface[face, slots[:, i]], factors[:, i]) for i in range(4))
+    return signed_distances(found.surface, pairs), (a + b) + (c + d)
+
+
+def forgets_some(elements: Elements, patches: Patches, found: Derivatives, row_faces: Int[np.ndarray, "m"]) -> bool:
+    """Whether values depend on unknowns that the elements do not know: seen in the derivative along the last seed."""
+    seed = np.append(flat(jax.tree.map(lambda rows: rows[-1], elements.seeds)), 0.0)[elements.columns]
+    of_surface, of_rows = (np.asarray(part) for part in found.along)
+    by_surface = np.einsum("fwdx,fd->fwx", np.asarray(found.by_surface), seed)
+    corners = patches.owner[:, None], patches.slots
+    surface = by_surface[corners] - of_surface[patches.vertices[corners]]
+    rows = np.einsum("md,md->m", np.asarray(found.by_rows), seed[row_faces]) - of_rows
+    return any(np.abs(off).max() > _WRONG * np.abs(of).max() for off, of in ((surface, of_surface), (rows, of_rows)))
+
+
+def flat(unknowns: Unknowns) -> Shaped[np.ndarray, "n"]:
+    """All unknowns as one vector, vertex by vertex and then h."""
+    parts = [np.asarray(part) for part in (unknowns.vertices, unknowns.normals) if part is not None]
+    h = np.zeros(0) if unknowns.h is None else np.ravel(np.asarray(unknowns.h))
+    return np.concatenate([np.concatenate(parts, axis=1).ravel() if parts else np.zeros(0), h])
+
+
+def normal_matrix(
+    elements: Elements,
+    by: Float[np.ndarray, "m d"],
+    weights: Float[np.ndarray, "m"],
+    face: Int[np.ndarray, "m"],
+) -> Float[np.ndarray, "_"]:
+    """Values of J' W J in the pattern of the elements."""
+    order = np.argsort(face, kind="stable")
+    ends = np.searchsorted(face, np.arange(len(elements.columns) + 1), sorter=order)
+    roots, sums = np.sqrt(weights), _Sums(elements)
+
+    def product(first: Int[np.ndarray, "b"], last: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b d d"]:
+        place = first[:, None] + np.arange(_ROWS_A_BLOCK)
+        inside = place < last[:, None]
+        rows = order[np.where(inside, place, 0)]
+        scaled = by[rows] * (roots[rows] * inside)[..., None]
+        return _products(scaled.transpose(0, 2, 1), scaled)
+
+    for run in elements.runs:
+        first, last = ends[run.faces], ends[run.faces.start + 1 : run.faces.stop + 1]
+        matrices = product(first, last)
+        while len(more := np.flatnonzero(last - first > _ROWS_A_BLOCK)):  # few faces have so many rows
+            first = first + _ROWS_A_BLOCK
+            matrices[more] += product(first[more], last[more])
+        sums.add(run, matrices)
+    return sums.values()
+
+
+def _products(a: Float[np.ndarray, "b m k"], b: Float[np.ndarray, "b k n"]) -> Float[np.ndarray, "b m n"]:
+    """Products of many small matrices, a few columns at a time: over a size OpenBLAS gives each to all cores, whose
+    threads then mostly wait for one another (on busy cores ten times as long)."""
+    columns = max(_ONE_THREAD // (a.shape[1] * a.shape[2]), 1)
+    return np.concatenate([np.matmul(a, b[..., i : i + columns]) for i in range(0, b.shape[2], columns)], axis=2)
+
+
+class _Sums:
+    """Sums of symmetric matrices, a control face each, in the pattern of the elements."""
+
+    def __init__(self, elements: Elements):
+        self._place = np.asarray(elements.pattern.data, np.intp)
+        self._lower = np.zeros(self._place.max(initial=-1) + 1)
+
+    def add(self, run: Run, matrices: Float[np.ndarray, "n d d"]) -> None:
+        if len(run.first):
+            self._lower[run.place] += np.add.reduceat(matrices.ravel()[run.source], run.first)
+
+    def values(self) -> Float[np.ndarray, "_"]:
+        return self._lower[self._place]
+
+
+def equations_of_many(
+    elements: Elements,
+    patches: Patches,
+    found: Derivatives,
+    pairs: Pairs,
+    weights: Float[np.ndarray, "p"],
+    at: Int[np.ndarray, "p"],
+) -> tuple[Float[np.ndarray, "_"], Float[np.ndarray, "n"]]:
+    """J' W J and J' W times the distances, of more pairs than the patches have vertices.
+
+    A distance depends on three or four vertices of the surface. What the pairs of a patch say of its vertices is summed
+    up first, and then taken to the unknowns, once a patch and not once a pair.
+
+    Args:
+        at: the face of the surface of each pair.
+    """
+    distances = np.asarray(jax.jit(signed_distances)(found.surface, pairs), np.float64)
+    corner_weights, directions = (np.asarray(part, np.float64) for part in (pairs.corner_weights, pairs.directions))
+    face, width = patches.owner[at], 3 * patches.vertices.shape[1]
+    order, d = np.argsort(face, kind="stable"), elements.columns.shape[1]
+    sums, gradient = _Sums(elements), np.zeros(elements.n + 1)
+    for run in elements.runs:
+        those = run.faces
+        n = those.stop - those.start
+        rows = order[slice(*np.searchsorted(face, (those.start, those.stop), sorter=order))]
+        factors = (corner_weights[rows, :, None] * directions[rows, None, :]).reshape(-1, 12)
+        coordinate = (3 * patches.slots[at[rows], :, None] + np.arange(3)).reshape(-1, 12)
+        place = (face[rows, None] - those.start) * width + coordinate
+        weighted = factors * weights[rows, None]
+        sides = np.bincount(place.ravel(), (weighted * distances[rows, None]).ravel(), n * width)
+        inner = np.bincount(
+            (place[:, :, None] * width + coordinate[:, None, :]).ravel(),
+            (weighted[:, :, None] * factors[:, None, :]).ravel(),
+            n * width * width,
+        ).reshape(n, width, width)
+        by = np.asarray(found.by_surface[those], np.float64).transpose(0, 1, 3, 2).reshape(n, width, d)
+        sums.add(run, _products(by.transpose(0, 2, 1), _products(inner, by)))
+        by_unknowns = np.matmul(sides.reshape(n, 1, width), by)
+        gradient += np.bincount(elements.columns[those].ravel(), by_unknowns.ravel(), elements.n + 1)
+    return sums.values(), gradient[:-1]
+
+
+def times_transposed(
+    elements: Elements, by: Float[np.ndarray, "m d"], values: Float[np.ndarray, "m"], face: Int[np.ndarray, "m"]
+) -> Float[np.ndarray, "n"]:
+    """J' times a value a row."""
+    products = by * values[:, None]
+    return np.bincount(elements.columns[face].ravel(), products.ravel(), minlength=elements.n + 1)[:-1]
+
+
+def jacobian(elements: Elements, by: Float[np.ndarray, "m d"], face: Int[np.ndarray, "m"]) -> sp.csr_array:
+    """J as a sparse matrix."""
+    m, d = by.shape
+    table = sp.csr_array(
+        (by.ravel(), elements.columns[face].ravel(), np.arange(0, m * d + 1, d)), shape=(m, elements.n + 1)
+    )
+    return table[:, :-1]
+
+
+def _vertices_near_faces(topology: js.Topology, rings: int) -> sp.csr_array:
+    """Faces by the vertices of the faces around them, `rings` rings of them."""
+    parts = [np.asarray(topology.control_faces[size]) for size in (3, 4)]
+    counts = np.concatenate([np.full(len(part), part.shape[1]) for part in parts])
+    corners = np.concatenate([part.ravel() for part in parts])
+    shape = (len(counts), topology.n_control_vertices)
+    at = sp.csr_array((np.ones(len(corners), np.int32), corners, np.append(0, np.cumsum(counts))), shape=shape)
+    near = at
+    for _ in range(rings):
+        near = ((near @ at.T) @ at).tocsr()
+    near.sort_indices()
+    return near
+
+
+def _colour(near: sp.csr_array) -> Int[np.ndarray, "v"]:
+    """A colour for every vertex, so that no two in one face have the same: greedily, the crowded ones first."""
+    together = (near.T @ near).tocsr()
+    colour = np.full(len(together.indptr) - 1, -1)
+    for vertex in np.argsort(-np.diff(together.indptr), kind="stable"):
+        taken = colour[together.indices[together.indptr[vertex] : together.indptr[vertex + 1]]]
+        free = np.ones(len(taken) + 1, bool)
+        free[taken[(taken >= 0) & (taken < len(free))]] = False
+        colour[vertex] = np.argmax(free)
+    return colour
+
+
+def _pattern(columns: Int[np.ndarray, "f d"], n: int) -> tuple[sp.csc_array, list[Run]]:
+    (n_faces, d), runs, keys_of_runs = columns.shape, [], []
+    one, other = np.tril_indices(d)
+    length = max(_ENTRIES_AT_ONCE // d**2, 1)
+    for start in range(0, n_faces, length):
+        those = columns[start : start + length]
+        row, column = np.maximum(those[:, one], those[:, other]), np.minimum(those[:, one], those[:, other])
+        face, entry = np.nonzero(row < n)
+        keys = column[face, entry].astype(np.int64) * n + row[face, entry]
+        order = np.argsort(keys, kind="stable")
+        keys = keys[order]
+        first = np.flatnonzero(np.diff(keys, prepend=-1))
+        source = (face * d**2 + one[entry] * d + other[entry])[order]
+        keys_of_runs.append(keys[first])
+        runs.append(Run(slice(start, start + len(those)), source, first, keys[first]))
+    keys = np.unique(np.concatenate(keys_of_runs))
+    runs = [run._replace(place=np.searchsorted(keys, run.place)) for run in runs]
+    column, row = keys // n, keys % n
+    beside = np.flatnonzero(row != column)
+    both = np.append(np.arange(len(keys)), beside)
+    rows, columns_ = np.append(row, column[beside]), np.append(column, row[beside])
+    order = np.lexsort((rows, columns_))
+    indptr = np.searchsorted(columns_[order], np.arange(n + 1))
+    return sp.csc_array((both[order], rows[order], indptr), shape=(n, n)), runs
+
+
+def padded(
+    pairs: Pairs, weights: Float[np.ndarray, "p"], face: Int[np.ndarray, "p"]
+) -> Iterator[tuple[Pairs, Float[np.ndarray, "s"], Int[np.ndarray, "s"]]]:
+    """Runs of pairs, the last filled up with pairs of weight 0, so that few programs are compiled for all scans."""
+    n, size = len(weights), _run_length(len(weights))
+    for first in range(0, n, size):
+        rows = np.minimum(np.arange(first, first + size), n - 1)
+        counted = np.where(np.arange(first, first + size) < n, weights[rows], 0.0)
+        yield Pairs(*(jnp.asarray(np.asarray(part)[rows]) for part in pairs)), counted, face[rows]
+
+
+def _run_length(n: int) -> int:
+    if n >= _PAIRS_AT_ONCE:
+        return _PAIRS_AT_ONCE
+    step = 1 << max(n.bit_length() - 3, 0)
+    return -(-n // step) * step
