@@ -2,13 +2,13 @@
 
 from .model.modes import Modes as Modes
 from .model.modes import shape_modes as shape_modes
+from .model.priors import Priors as Priors
 from .model.priors.boundary import BoundaryCurve as BoundaryCurve
 from .model.priors.boundary import boundary_of as boundary_of
+from .model.priors.shape_modes import ShapeModes as ShapeModes
 from .model.priors.symmetry import Symmetry as Symmetry
 from .model.priors.symmetry import find_symmetry as find_symmetry
-from .model.recipe import Recipe as Recipe
-from .model.recipe import load_recipe as load_recipe
-from .model.residual import Priors as Priors
+from .model.residual import Residual as Residual
 from .model.robust import AbstractLoss as AbstractLoss
 from .model.robust import Barron as Barron
 from .model.robust import Huber as Huber
@@ -25,13 +25,15 @@ from .report.refit import Refit as Refit
 from .report.report import Report as Report
 from .report.report import WorstPlace as WorstPlace
 from .report.result import FitResult as FitResult
-from .report.saved import load as load
 from .run.cohort import fit_cohort as fit_cohort
 from .run.fit import Sweep as Sweep
-from .run.fit import fit as fit
 from .run.fit_scan import ScanFit as ScanFit
-from .run.fit_scan import fit_scan as fit_scan
 from .run.fit_scan import misfit as misfit
+from .run.recipe import Recipe as Recipe
+from .run.recipe import fit as fit
+from .run.recipe import fit_scan as fit_scan
+from .run.recipe import load as load
+from .run.recipe import load_recipe as load_recipe
 from .scan.closest_points import closest_points as closest_points
 from .scan.example import example as example
 from .scan.landmarks import Landmarks as Landmarks
@@ -41,6 +43,9 @@ from .scan.scan import Scan as Scan
 from .scan.scan import ScanError as ScanError
 from .scan.scan import read_scan as read_scan
 from .scan.search_closest import search_closest as search_closest
+from .solve.sparse_normal import SparseNormal as SparseNormal
+from .solve.sparse_normal import sparse_solver as sparse_solver
+from .solve.sweeps import Sweeps as Sweeps
 from .start.align import Alignment as Alignment
 from .start.align import align as align
 from .start.control_mesh import control_mesh as control_mesh

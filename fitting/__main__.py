@@ -23,13 +23,12 @@ from jaxsubdiv.console import plain_warnings
 from jaxsubdiv.files import replacing
 
 from .model.priors.boundary import BoundaryCurve, boundary_of
-from .model.recipe import Recipe, load_recipe
 from .report.page import write_page
 from .report.picture import draw_fit, surface_distances
 from .report.result import FitResult
-from .report.saved import load
 from .run.fit import CHECKPOINT, Sweep
 from .run.fit_scan import CHECKPOINT_START, ScanFit, misfit
+from .run.recipe import Recipe, load, load_recipe
 from .scan.example import Example, example
 from .scan.landmarks import Landmarks, match_landmarks, read_landmarks
 from .scan.scan import Scan, read_scan

@@ -5,6 +5,10 @@ from importlib.metadata import version as _version
 from ._admissible import admissible_margin as admissible_margin
 from ._control import Control as Control
 from ._control import strong_float as strong_float
+from ._control_faces import child_edge_faces as child_edge_faces
+from ._control_faces import control_edges as control_edges
+from ._control_faces import control_faces_of as control_faces_of
+from ._control_faces import splits_in_four as splits_in_four
 from ._creases import Creases as Creases
 from ._curvature import Curvatures as Curvatures
 from ._curvature import curvatures as curvatures

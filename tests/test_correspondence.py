@@ -183,6 +183,56 @@ def test_many_points_go_in_parts_with_the_same_result(monkeypatch, at_once):
     np.testing.assert_array_equal(parts.uv, whole.uv)
 
 
+@pytest.mark.parametrize("shape", ["open", "needles", "one large among small"])
+def test_place_of_a_point_does_not_depend_on_the_other_points(shape):
+    surface = surface_of(TRIANGLES[shape])
+    points = some_points(surface)
+    whole = closest_points(surface, points)
+    for rows in ([7], np.arange(3, len(points), 5), np.arange(len(points))[::-1]):
+        some = closest_points(surface, points[rows])
+        np.testing.assert_array_equal(some.face, np.asarray(whole.face)[rows])
+        np.testing.assert_array_equal(some.uv, np.asarray(whole.uv)[rows])
+
+
+def test_of_equally_near_faces_the_first_is_found():
+    vertices, faces = meshes.octahedron()
+    rng = np.random.default_rng(2)
+    order = [faces[i] for i in rng.permutation(len(faces))]
+    points = np.concatenate([vertices * 3, np.zeros((1, 3))])
+    at = closest_points(surface_of((vertices, order)), points)
+    holding = [min(f for f, face in enumerate(order) if v in face) for v in range(len(vertices))]
+    np.testing.assert_array_equal(at.face, [*holding, 0])
+    twice = closest_points(surface_of((vertices, [*order, *order])), some_points(surface_of((vertices, order))))
+    assert np.asarray(twice.face).max() < len(order)
+
+
+def test_surface_far_from_the_origin_is_searched_exactly():
+    vertices, faces = TRIANGLES["torus"]
+    surface = surface_of((vertices + 1e6, faces))
+    points = some_points(surface)
+    expected = distances_to_every(corners_of(surface) - 1e6, points - 1e6)
+    np.testing.assert_allclose(distances(surface, points), expected, rtol=1e-9, atol=1e-8)
+
+
+def test_no_points_have_no_places():
+    at = closest_points(surface_of(TRIANGLES["torus"]), np.zeros((0, 3)))
+    assert at.face.shape == (0,) and at.uv.shape == (0, 2)
+
+
+@pytest.mark.parametrize("off", [0.0, 0.3, 40.0])
+def test_refined_surface_is_searched_exactly_near_and_far(off):
+    mesh = js.ControlMesh(*stretched(meshes.torus(8, 6, "triangle"), 10, 10, 10))
+    topology = js.build_topology(mesh, js.Interpolating(), 2)
+    surface = js.refine(js.Interpolating(), topology, mesh.control())
+    rng = np.random.default_rng(4)
+    at = js.SurfacePoint(rng.integers(surface.n_faces, size=120), rng.uniform(0.0, 0.5, (120, 2)))
+    on, normals = js.evaluate(surface, at)
+    points = np.asarray(on + off * normals) + rng.normal(scale=0.05, size=(120, 3))
+    points[::20] = rng.uniform(-80, 80, (6, 3))  # few that are farther than the others
+    expected = distances_to_every(corners_of(surface), points)
+    np.testing.assert_allclose(distances(surface, points), expected, rtol=1e-10, atol=1e-11)
+
+
 @pytest.mark.parametrize("kind", ["quad", "triangle", "mixed"])
 def test_place_on_the_surface_is_found_again(kind):
     surface = surface_of(meshes.grid(6, 5, kind, bumpy=0.1))

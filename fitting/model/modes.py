@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..solve.problem import moved_to
+from .procrustes import align_shape
 
 _STEPS, _SETTLED = 20, 1e-9
 
@@ -55,7 +55,7 @@ def shape_modes(vertices: ArrayLike, *, size: bool = False) -> Modes:
     usual, mean = float(np.mean(np.linalg.norm(x, axis=(1, 2)))), x[0]
     for _ in range(_STEPS):
         mean = mean * (usual / np.linalg.norm(mean))  # averaging, and scaling by parts, would shrink it to nothing
-        x = np.stack([moved_to(one, mean, scale=size) for one in x])
+        x = np.stack([align_shape(one, mean, scale=size) for one in x])
         last, mean = mean, x.mean(axis=0)
         if np.linalg.norm(mean - last) <= _SETTLED * usual:
             break

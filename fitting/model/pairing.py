@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-import jax
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -12,12 +12,15 @@ import jaxsubdiv as js
 from jaxsubdiv import corner_weights
 from jaxsubdiv.linalg import dot, norm, unit
 
-from ..scan.closest_points import closest_points, nearest_rows
+from ..scan.closest_points import boundary_vertices, nearest_rows
 from ..scan.outliers import NEIGHBOURS, is_dense, scattered_points
 from ..scan.scan import Scan
+from ..scan.slices import Strokes, find_strokes
+from .priors.shifts import SlicePlanes
 from .residual import Pairs
 from .robust import AbstractLoss, noise_scale
 
+LEAST_NOISE = 1e-4  # in control edges: a perfect scan would have none, and its points infinite weight
 _BOUNDARY_SCALE = 1 / 3  # least scale of the loss at an open boundary, in control edges
 _ON_BOUNDARY = 1e-3  # how far, in parts of a face, a surface point may lie from a boundary and count as on it
 _NEIGHBOURS = 9
@@ -77,45 +80,69 @@ def surroundings(scan: Scan) -> Surroundings:
     return Surroundings(crowded, scattered, crowded & clean, neighbours)
 
 
-def look(
-    surface: js.RefinedSurface,
-    scan: Scan,
-    open_vertices: Bool[np.ndarray, "v"],
-    around: Surroundings,
-    edge: float,
-    loss: AbstractLoss,
-    floor: float,
-    held: Bool[np.ndarray, "v"] | None = None,
-) -> Look:
-    """Pair every scan point with the closest point of the surface, and weigh the pairs by how far apart they lie.
+class Scene(NamedTuple):
+    """A scan, and what of it stays the same while the surface moves: the `args` of a fit's solver."""
+
+    scan: Scan
+    """Without its slices."""
+    around: Surroundings
+    strokes: Strokes | None
+    of_points: Int[Array | np.ndarray, "p"] | None
+    """The row of the slice of each point that may be shifted, -1 where it stays; None where none may."""
+    open_vertices: Bool[Array | np.ndarray, "v"]
+    """Which vertices of the surface lie on a boundary."""
+    part: Float[Array | np.ndarray, ""]
+    """Of the rows of the scan, that are points; less than 1 where the rest fills up an array."""
+
+
+def make_scene(scan: Scan, surface: js.RefinedSurface, planes: SlicePlanes | None = None) -> Scene:
+    """The scene of a scan.
 
     Args:
-        open_vertices: which vertices of the surface lie on a boundary.
-        around: of the scan's points, see `surroundings`.
-        edge: length of a control edge in mm.
-        loss: how a point loses weight with its distance.
-        floor: the least scale of the loss in mm.
-        held: vertices of the boundary that lie where they should: points beyond them do not count.
+        surface: any that has the faces of those to come.
+        planes: of the slices that may be shifted.
     """
-    at = closest_points(surface, np.asarray(scan.points))
-    edge_and_floor = (jnp.asarray(value, scan.points.dtype) for value in (edge, floor))
-    return measure(surface, scan, at, open_vertices, around, *edge_and_floor, loss, held)
+    of_points = None if planes is None else planes.rows_of(scan)
+    part = np.ones((), scan.points.dtype)
+    return Scene(
+        scan.without_slices(), surroundings(scan), find_strokes(scan), of_points, boundary_vertices(surface), part
+    )
 
 
-@jax.jit
+def empty_look(scene: Scene) -> Look:
+    """What is known before the first look: nothing."""
+    points = jnp.asarray(scene.scan.points)
+    n, none = len(points), jnp.zeros_like(points[:, 0])
+    corners, zero = jnp.zeros((n, 4), jnp.int32), jnp.zeros((), points.dtype)
+    pairs = Pairs(points, corners, jnp.zeros((n, 4), points.dtype), jnp.zeros_like(points))
+    at = js.SurfacePoint(jnp.zeros(n, jnp.int32), jnp.zeros((n, 2), points.dtype))
+    return Look(at, pairs, none, none, none, zero, zero, zero, zero)
+
+
+@eqx.filter_jit
 def measure(
     surface: js.RefinedSurface,
-    scan: Scan,
+    scene: Scene,
+    points: Float[Array, "p 3"],
     at: js.SurfacePoint,
-    open_vertices: Bool[Array | np.ndarray, "v"],
-    around: Surroundings,
     edge: Float[Array, ""],
     floor: Float[Array, ""],
     loss: AbstractLoss,
-    held: Bool[Array | np.ndarray, "v"] | None = None,
+    covered: Bool[Array | np.ndarray, "v"] | None = None,
 ) -> Look:
+    """Weigh pairs of scan points and their closest points of the surface by how far apart they lie.
+
+    Args:
+        points: of the scan, with the shifts of their slices put on.
+        at: the closest point of the surface of each.
+        edge: length of a control edge in mm.
+        floor: the least scale of the loss in mm.
+        loss: how a point loses weight with its distance.
+        covered: vertices of the boundary that lie where they should: points beyond them do not count.
+    """
+    scan, around, open_vertices = scene.scan, scene.around, scene.open_vertices
     on, normals = js.evaluate(surface, at)
-    away = scan.points - on
+    away = points - on
     distance, spread = norm(away)[:, 0], scan.relative_deviations()
     given = jnp.where(around.scattered, 0.0, scan.weights_or_ones())
     corners, inside = corner_weights(surface, at)
@@ -139,17 +166,20 @@ def measure(
     weights = given * loss.weight(own / at_its_scale)
     across = jnp.abs(dot(normals, away))[:, 0]
     goes_on = around.crowded & (distance < edge) & (across < 3 * scale * spread + _STEEPEST * distance)
-    if held is not None:
-        goes_on &= ~on_boundary(held, corners, inside)
+    if covered is not None:
+        goes_on &= ~on_boundary(covered, corners, inside)
     weights = jnp.where(at_boundary & ~goes_on, 0.0, weights)
+    alike = jnp.ones((), points.dtype)
+    if scene.strokes is not None:
+        alike = scene.strokes.count_points_a_measurement(signed, weights)
     # The derivative of a distance is along it: across the face, or from the edge or boundary that is closest.
     directions = jnp.where(distance[:, None] > edge * _ON_SURFACE, unit(away), normals)
     return Look(
         at=at,
-        pairs=Pairs(scan.points, corners, inside, directions),
+        pairs=Pairs(points, corners, inside, directions),
         distances=signed,
         weights=weights,
-        precisions=weights / jnp.mean(scan.weights_or_ones()) / (scale * spread) ** 2,
+        precisions=weights * scene.part / jnp.mean(scan.weights_or_ones()) / (scale * spread) ** 2 / alike,
         noise=noise,
         scale=scale,
         rms=_mean_root(distance, scan.weights_or_ones()),

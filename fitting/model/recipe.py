@@ -1,48 +1,30 @@
-"""The settings of a fit as a small JSON file, which fits the next scan in the same way, from the points on."""
+"""The settings of a fit, and their JSON text."""
 
 import dataclasses
 import json
-import os
 from collections.abc import Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_args
+from typing import Any, Self, TypeVar, get_args
 
 import equinox as eqx
 import numpy as np
 
 import jaxsubdiv as js
 
-from ..scan.scan import Scan
 from ..start.align import Kind
 from ..start.control_mesh import FaceKind
-from .residual import Priors
+from .priors import Priors
+from .priors.shape_modes import ShapeModes
 from .robust import AbstractLoss, Barron, Huber, LeastSquares, Tukey, geman_mcclure
 from .unknowns import Free
 
-if TYPE_CHECKING:
-    from ..report.result import FitResult
-    from ..run.fit_scan import ScanFit
-
 _VERSION = 2  # 1 had no settings of `fit_scan`, which then are the defaults
-_SCHEMES = {
-    kind.__name__: kind
-    for kind in (
-        js.BezierTriangle,
-        js.CatmullClark,
-        js.CirclePreserving,
-        js.DooSabin,
-        js.Interpolating,
-        js.Kobbelt,
-        js.Loop,
-        js.ModifiedButterfly,
-    )
-}
+_SCHEMES = {kind.__name__: kind for kind in js.SCHEMES.values()}
 _LOSSES = {kind.__name__: kind for kind in (Barron, Huber, LeastSquares, Tukey)}
 _M = TypeVar("_M", bound=eqx.Module)
 
 
 @dataclasses.dataclass(frozen=True)
-class Recipe:
+class Settings:
     """All that `fit` and `fit_scan` are told besides the data: scan, control mesh and landmarks.
 
     Attributes:
@@ -75,44 +57,15 @@ class Recipe:
     mesh_normals: bool = False
     limit: bool = False
 
-    def fit(self, mesh: js.ControlMesh, scan: Scan, **options: Any) -> "FitResult":
-        """Fit a control mesh to a scan in this way.
-
-        Args:
-            mesh: where the fit starts, roughly aligned with the scan and in mm.
-            scan: the measured points in mm.
-            options: more for `fit`, such as `throw` and `on_sweep`; they come before the recipe's own.
-        """
-        from ..run.fit import fit  # which makes recipes itself
-
-        own = {"free": self.free, "priors": self.priors, "loss": self.loss}
-        own |= {"max_sweeps": self.max_sweeps, "tolerance": self.tolerance}
-        own |= {"landmark_deviation": self.landmark_deviation}
-        control = mesh.control(weights=self.scheme.weights)
-        return fit(self.scheme, self.topology(mesh), control, scan, **(own | options))
-
-    def fit_scan(self, scan: Scan, mesh: js.ControlMesh | None = None, **options: Any) -> "ScanFit":
-        """Fit a scan from end to end in this way, as `fit_scan` does.
-
-        Args:
-            scan: in mm.
-            mesh: the template; default: a control mesh is made from the scan.
-            options: more for `fit_scan`, such as `landmarks` and `throw`; they come before the recipe's own.
-        """
-        from ..run.fit_scan import fit_scan  # which makes recipes itself
-
-        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return fit_scan(scan, mesh, **(own | options))
-
     def topology(self, mesh: js.ControlMesh) -> js.Topology:
         """Tables of a control mesh, as `fit` needs them."""
         return js.build_topology(mesh, self.scheme, self.levels, mesh_normals=self.mesh_normals, limit=self.limit)
 
-    @staticmethod
-    def of(scheme: js.AbstractScheme, topology: js.Topology, **settings: Any) -> "Recipe":
+    @classmethod
+    def of(cls, scheme: js.AbstractScheme, topology: js.Topology, **settings: Any) -> Self:
         """The recipe of a fit on these tables; `settings` are the other attributes."""
         of_tables = {"mesh_normals": topology.mesh_normals, "limit": topology.limit is not None}
-        return Recipe(scheme, len(topology.levels), **of_tables, **settings)
+        return cls(scheme, len(topology.levels), **of_tables, **settings)
 
     def to_json(self) -> str:
         """The recipe as JSON text, exact to the last bit. Infinite numbers, which JSON does not have, are words.
@@ -131,8 +84,8 @@ class Recipe:
             values[field.name] = value
         return json.dumps(values, indent=2, allow_nan=False)
 
-    @staticmethod
-    def from_json(text: str) -> "Recipe":
+    @classmethod
+    def from_json(cls, text: str) -> Self:
         """The recipe of JSON text; what the text leaves out keeps its default, but for the scheme and its levels.
 
         Raises:
@@ -149,13 +102,13 @@ class Recipe:
         version = values.pop("version", _VERSION)
         if version not in range(1, _VERSION + 1):
             raise ValueError(f"a recipe of version {version!r}, but this release reads up to {_VERSION}. Update it.")
-        fields = {field.name for field in dataclasses.fields(Recipe)}
+        fields = {field.name for field in dataclasses.fields(cls)}
         _refuse_others("a recipe", values, fields)
         makers = {
             "scheme": lambda value: _named("scheme", value, _SCHEMES),
             "loss": lambda value: _named("loss", value, _LOSSES),
             "free": lambda value: _from_plain("free", Free, value),
-            "priors": lambda value: _from_plain("priors", Priors, value),
+            "priors": _priors,
             "levels": lambda value: _checked("levels", value, int),
             "max_sweeps": lambda value: _checked("max_sweeps", value, int),
             "tolerance": lambda value: _number("tolerance", value),
@@ -170,20 +123,7 @@ class Recipe:
             "mesh_normals": lambda value: _checked("mesh_normals", value, bool),
             "limit": lambda value: _checked("limit", value, bool),
         }
-        return Recipe(**{name: makers[name](value) for name, value in values.items()})
-
-
-def load_recipe(path: str | os.PathLike[str]) -> Recipe:
-    """The recipe of a file, such as the `recipe.json` of a saved fit: `load_recipe(path).fit_scan(scan)`.
-
-    Raises:
-        OSError: there is no such file.
-        ValueError: it is no recipe; the text names the file and what is wrong.
-    """
-    try:
-        return Recipe.from_json(Path(path).read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        return cls(**{name: makers[name](value) for name, value in values.items()})
 
 
 def _known_name(what: str, module: eqx.Module, known: Mapping[str, type]) -> str:
@@ -195,6 +135,12 @@ def _known_name(what: str, module: eqx.Module, known: Mapping[str, type]) -> str
     return name
 
 
+def _priors(value: Any) -> Priors:
+    if isinstance(value, dict) and value.get("shape") is not None:
+        value = value | {"shape": _from_plain("shape", ShapeModes, value["shape"])}
+    return _from_plain("priors", Priors, value)
+
+
 def _to_plain(module: eqx.Module) -> dict[str, Any]:
     """The arguments that make a module, as JSON has them."""
     return {field.name: _plain(getattr(module, field.name)) for field in dataclasses.fields(module) if field.init}
@@ -203,6 +149,8 @@ def _to_plain(module: eqx.Module) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     if value is None or isinstance(value, (str, bool)):
         return value
+    if isinstance(value, eqx.Module):
+        return _to_plain(value)
     value = np.asarray(value)
     if value.ndim:
         return [_plain(row) for row in value]

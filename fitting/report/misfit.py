@@ -6,10 +6,9 @@ with it, the residuals have lost. So E[e^2] = E[r s] + 2 v. Source: B. Efron, Th
 covariance penalties and cross-validation, 2004, eq. (2.8). The posterior variance is v once; the rest is the misfit.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
-import scipy.sparse as sp
 from jaxtyping import Float, Int
 
 _FEWEST = 0.5  # pairs a point, of whose products a neighbourhood's mean is taken
@@ -22,7 +21,8 @@ def misfit_variances(
     weights: Float[np.ndarray, "p"],
     variances: Float[np.ndarray, "p"],
     patches: Sequence[Int[np.ndarray, "p"]],
-    around: sp.csr_array,
+    average: Callable[[Float[np.ndarray, "f"]], Float[np.ndarray, "f"]],
+    n_faces: int,
 ) -> Float[np.ndarray, "f"]:
     """Mean square in mm^2 of what the surface is off beyond its posterior variance, over a control face and those
     around it; 0 where there are too few points to tell.
@@ -33,9 +33,10 @@ def misfit_variances(
         variances: posterior ones of the surface at the points, in mm^2.
         patches: where each point lies: the control face, then finer and finer parts of it. Points that lie in one
             patch are compared, of the finest patches that have enough.
-        around: see `neighbourhoods`.
+        average: over a control face and those around it, see `neighbourhood_mean`.
+        n_faces: number of control faces.
     """
-    counted, n_faces = weights > 0, len(around.indptr) - 1
+    counted = weights > 0
     if not counted.any():
         return np.zeros(n_faces)
     enough = [patch for patch in patches if counted.sum() >= _A_PATCH * len(np.unique(patch[counted]))]
@@ -49,5 +50,5 @@ def misfit_variances(
     mean_variance = np.bincount(patch, weights * variances) / (count + _TINY)
     pairs = count**2 - np.bincount(patch, weights**2)
     products = total**2 - np.bincount(patch, (weights * distances) ** 2) + pairs * mean_variance
-    pairs, products = (around @ np.bincount(face, values / (count + _TINY), n_faces) for values in (pairs, products))
+    pairs, products = (average(np.bincount(face, values / (count + _TINY), n_faces)) for values in (pairs, products))
     return np.where(pairs > _FEWEST, np.maximum(products, 0) / np.maximum(pairs, _FEWEST), 0)

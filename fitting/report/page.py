@@ -73,7 +73,7 @@ def _data(
     vertices = np.asarray(surface.vertices, np.float64)
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     radius = float(np.linalg.norm(vertices - centre, axis=1).max())
-    distances = distances_to_scan(surface, result._seen, result.inliers)
+    distances = distances_to_scan(surface, result.fit.look, result.inliers)
     normals = np.asarray(surface.normals, np.float64)
     some = np.linspace(0, result.scan.n_points - 1, min(result.scan.n_points, _MOST_POINTS)).astype(int)
     deviation = result.uncertainty().surface if uncertainty else None

@@ -1,6 +1,7 @@
 """The fit as a differentiable function of the scan, at the correspondences, weights and priors that it ended with."""
 
-from typing import NamedTuple, final
+import math
+from typing import Any, NamedTuple, final
 
 import equinox as eqx
 import jax
@@ -12,10 +13,9 @@ from jaxtyping import Array, Float
 
 import jaxsubdiv as js
 
-from ..model.priors.symmetry import Mirror
-from ..model.residual import Pairs, Rows, Start, residuals
-from ..model.unknowns import Unknowns, apply_offset, no_offset
-from ..solve.elements import to_unknowns
+from ..model.residual import Held, Model, Residual
+from ..model.unknowns import Variables
+from ..solve.sweeps import shift_points
 from .posterior import Posterior
 
 _MOST_STEPS = 40
@@ -26,15 +26,12 @@ _MOST_UNKNOWNS = 8000  # whose posterior is whitened, in 512 MB
 class _Fixed(NamedTuple):
     """What does not depend on the scan."""
 
-    start: Start
-    pairs: Pairs
-    zero: Unknowns
+    model: Model
+    y: Variables
+    held: Held
     shifts: Float[Array, "p 3"] | None
     """Of every point, in mm, where slices were free to move."""
-    precisions: Float[Array, "p"]
-    prior_precisions: Rows
     hold: Float[Array, "n"]
-    mirror: Mirror | None
     whitening: Float[Array, "n u"]
     """Takes unknowns of variance 1, as the posterior has them, to offsets."""
     left: Float[Array, "u"]
@@ -72,8 +69,8 @@ class Refit(eqx.Module):
             EquinoxRuntimeError: the solve does not converge: the points are too far from the scan's.
         """
         fixed = self._fixed
-        if points.shape != fixed.pairs.points.shape:
-            raise ValueError(f"the fit had points {list(fixed.pairs.points.shape)}; got {list(points.shape)}.")
+        if points.shape != fixed.held.pairs.points.shape:
+            raise ValueError(f"the fit had points {list(fixed.held.pairs.points.shape)}; got {list(points.shape)}.")
         dtype = fixed.whitening.dtype
         points = jnp.asarray(points, dtype)
         weights = jnp.ones_like(points[:, 0]) if weights is None else jnp.asarray(weights, dtype)
@@ -86,8 +83,8 @@ class Refit(eqx.Module):
             adjoint=optx.ImplicitAdjoint(linear_solver=_linear(of_derivative)),
             max_steps=_MOST_STEPS,
         )
-        offset, start = to_unknowns(fixed.whitening @ found.value, fixed.zero), fixed.start
-        return apply_offset(start.topology, start.scheme, start.control, offset)
+        y = fixed.model.retract(fixed.y, fixed.model.layout.split(fixed.whitening @ found.value))
+        return fixed.model.scheme_at(y), y.control
 
 
 def _slope(z: Float[Array, "u"], args: tuple[Array, Array, _Fixed]) -> Float[Array, "u"]:
@@ -109,15 +106,14 @@ def _tolerances(points: Float[Array, "p 3"]) -> tuple[float, float]:
 def _cost(
     z: Float[Array, "u"], points: Float[Array, "p 3"], weights: Float[Array, "p"], fixed: _Fixed
 ) -> Float[Array, ""]:
-    vector = fixed.whitening @ z
-    offset, start = to_unknowns(vector, fixed.zero), fixed.start
+    vector, held = fixed.whitening @ z, fixed.held
     points = points if fixed.shifts is None else points + fixed.shifts
-    rows = residuals(offset, start, fixed.pairs._replace(points=points))
-    precisions = fixed.prior_precisions._replace(distance=fixed.precisions * weights)
-    terms = [jnp.sum(precision * row**2) for precision, row in zip(precisions, rows, strict=True)]
-    if fixed.mirror is not None:
-        _, control = apply_offset(start.topology, start.scheme, start.control, offset)
-        terms.append(jnp.sum(fixed.mirror.rows(control, jnp) ** 2))
+    held = held._replace(
+        pairs=held.pairs._replace(points=points), distance_precisions=held.distance_precisions * weights
+    )
+    y = fixed.model.retract(fixed.y, fixed.model.layout.split(vector))
+    rows, precisions = Residual(fixed.model).rows(y, held), {"distance": held.distance_precisions} | held.precisions
+    terms = [jnp.sum(jnp.asarray(precisions[name], row.dtype) * row**2) for name, row in rows.items()]
     return 0.5 * (jnp.sum(jnp.stack(terms)) + jnp.sum(fixed.hold * vector**2))
 
 
@@ -127,36 +123,37 @@ def make_refit(posterior: Posterior) -> Refit:
     Raises:
         ValueError: there are too many unknowns to whiten.
     """
-    problem, dtype = posterior.problem, posterior.control.vertices.dtype
-    n, free = problem.elements.n, problem.is_free
-    if free.sum() > _MOST_UNKNOWNS:
+    fit, equations = posterior.fit, posterior.equations
+    layout, dtype = fit.model.layout, fit.y.control.vertices.dtype
+    # The plane of symmetry and the shifts of slices are held: what a sweep moves along with it stays.
+    moves = [of.lasting and name != "shifts" for name, of in layout.shared for _ in range(math.prod(of.shape))]
+    which = np.flatnonzero(np.append(np.asarray(fit.model.is_free)[: layout.n_own] > 0, np.array(moves, bool)))
+    if len(which) > _MOST_UNKNOWNS:
         raise ValueError(
-            f"the fit has {free.sum()} unknowns; its derivative is for up to {_MOST_UNKNOWNS}. "
+            f"the fit has {len(which)} unknowns; its derivative is for up to {_MOST_UNKNOWNS}. "
             "Fit a coarser control mesh."
         )
-    whitening = np.zeros((n, int(free.sum())))
-    conditional = posterior.matrix.toarray()[: posterior.n_free, : posterior.n_free]  # given the shifts
+    whitening = np.zeros((layout.n, len(which)))
     # Where control vertices turned back from sweep to sweep the cost need not be convex, unless they are held.
-    hold = problem.last_hold
-    conditional += np.diag((hold - problem.loose)[free])
-    whitening[free] = np.linalg.inv(np.linalg.cholesky(conditional)).T
+    whitening[which] = np.linalg.inv(np.linalg.cholesky(equations.to_dense(fit.last_hold, which))).T
 
-    def on_device(values: object) -> Array:
-        return jnp.asarray(values, dtype)
+    def on_device(values: Any) -> Any:
+        is_float = isinstance(values, (np.ndarray, Array)) and jnp.issubdtype(values.dtype, jnp.floating)
+        return jnp.asarray(values, dtype if is_float else None)
 
-    mirror = problem.mirror(posterior.control)
+    held = jax.tree.map(on_device, equations.held._replace(of_points=None, shifts=None))
+    shifts = None
+    if fit.shifting and fit.scene.of_points is not None:
+        shifts = on_device(shift_points(fit.model, fit.y.shared["shifts"], fit.scene.of_points))
     fixed = _Fixed(
-        start=problem.start(posterior.scheme, posterior.control),
-        pairs=posterior.seen.pairs,
-        zero=no_offset(problem.free, posterior.scheme, posterior.control),
-        shifts=None if posterior.shifts is None else on_device(posterior.shifts.of_points()),
-        precisions=on_device(problem.distance_precisions(posterior.seen)),
-        prior_precisions=Rows(*map(on_device, problem.prior_precisions())),
-        hold=on_device(hold),
-        mirror=jax.tree.map(lambda a: on_device(a) if a.dtype.kind == "f" else a, mirror),
+        model=fit.model,
+        y=fit.y,
+        held=held,
+        shifts=shifts,
+        hold=on_device(fit.last_hold),
         whitening=on_device(whitening),
-        left=jnp.zeros(whitening.shape[1], dtype),
+        left=jnp.zeros(len(which), dtype),
     )
-    points = fixed.pairs.points if fixed.shifts is None else fixed.pairs.points - fixed.shifts  # the scan's own
-    left = jax.jit(jax.grad(_cost))(fixed.left, points, jnp.ones_like(points[:, 0]), fixed)
+    points = held.pairs.points if shifts is None else held.pairs.points - shifts  # the scan's own
+    left = eqx.filter_jit(jax.grad(_cost))(fixed.left, points, jnp.ones_like(points[:, 0]), fixed)
     return Refit(fixed._replace(left=left))

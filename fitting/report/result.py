@@ -1,6 +1,8 @@
 """What a fit returns."""
 
+import dataclasses
 import functools
+import math
 import os
 import warnings
 from typing import final
@@ -11,14 +13,12 @@ from jaxtyping import Bool, Float
 
 import jaxsubdiv as js
 
-from ..model.pairing import Look
-from ..model.priors.shifts import Shifts
-from ..model.recipe import Recipe
-from ..model.view import View
+from ..model.pairing import make_scene
+from ..model.recipe import Settings
 from ..scan.scan import Scan
-from ..solve.problem import Problem
 from .coverage import distances_to_scan, vertex_areas, weighted_quantile, worst_places
 from .posterior import Posterior, Uncertainty
+from .record import Fit, look_at
 from .refit import Refit, make_refit
 from .report import Report, SliceShift, WorstPlace
 
@@ -50,44 +50,28 @@ class FitResult:
         points: the scan's points with these shifts put on: where the distances are measured from.
     """
 
-    def __init__(
-        self,
-        *,
-        control: js.Control,
-        scheme: js.AbstractScheme,
-        surface: js.RefinedSurface,
-        scan: Scan,
-        rms: Float[np.ndarray, "sweeps"],
-        robust_rms: Float[np.ndarray, "sweeps"],
-        result: optx.RESULTS,
-        problem: Problem,
-        seen: Look,
-        recipe: Recipe | None = None,
-        start: js.Control | None = None,
-        shifts: Shifts | None = None,
-    ):
-        self.control = control
-        self.scheme = scheme
-        self.surface = surface
-        self.scan = scan
-        self.at = seen.at
-        self.distances = np.asarray(seen.distances)
-        self.weights = np.asarray(seen.weights)
-        self.rms = rms
-        self.robust_rms = robust_rms
-        self.noise = float(seen.noise)
-        self.result = result
-        self.recipe = recipe
-        self.start = start
-        self.likeness = problem.likeness_of_all
-        self.shifts = np.zeros((0, 3)) if shifts is None else shifts.vectors
-        self.slices = np.zeros(0, int) if shifts is None else shifts.slices
-        self._problem, self._seen, self._shifts = problem, seen, shifts
+    def __init__(self, fit: Fit, *, recipe: Settings | None = None):
+        """
+        Args:
+            fit: what was found.
+            recipe: the settings, where they are not those of the fit.
+        """
+        self.fit = fit
+        self.control, self.scheme, self.surface = fit.y.control, fit.model.scheme_at(fit.y), fit.surface()
+        self.scan, self.start = fit.scan, fit.start
+        self.at, self.distances, self.weights = (
+            fit.look.at,
+            np.asarray(fit.look.distances),
+            np.asarray(fit.look.weights),
+        )
+        self.rms, self.robust_rms, self.noise = fit.rms, fit.robust_rms, float(fit.look.noise)
+        self.result, self.recipe = fit.result, recipe or fit.settings
+        self.likeness, self.shifts, self.slices = fit.likeness, fit.shifts, fit.slices
 
     @functools.cached_property
     def posterior(self) -> Posterior:
         """The surfaces that scan and priors leave probable; made when it is first asked for."""
-        return Posterior(self._problem, self.scheme, self.control, self._seen, self._shifts)
+        return Posterior(self.fit)
 
     def uncertainty(self) -> Uncertainty:
         """Standard deviations of the control vertices and of the surface's vertices, across the surface, in mm.
@@ -106,9 +90,7 @@ class FitResult:
     @functools.cached_property
     def control_mesh(self) -> js.ControlMesh:
         """The fitted control mesh with its normals, for `js.write_mesh`."""
-        return js.ControlMesh(
-            self.control.vertices, self._problem.topology.control_faces, self.control.normals, check=False
-        )
+        return js.ControlMesh(self.control.vertices, self.fit.topology.control_faces, self.control.normals, check=False)
 
     def refit(self) -> Refit:
         """The fitted control as a differentiable function of scan points and weights; see `Refit`.
@@ -132,31 +114,17 @@ class FitResult:
         Correspondences, distances, noise, report and uncertainty are those of its points; the convergence is that of
         the fit. Slices keep the shifts that the fit found for their numbers. The misfit in the uncertainty is somewhat
         too large where the points were not those of the fit.
-
-        Raises:
-            ValueError: the fit does not know its settings.
         """
-        if self.recipe is None:
-            raise ValueError("this fit does not know its settings: only what `fit` returned can be measured again.")
-        edge = float(js.edge_length(self._problem.topology, self.control.vertices))
-        shifts = None if self._shifts is None or scan.slices is None else self._shifts.of(scan)
-        seen = View(scan, self.surface, edge, self.recipe.loss, self._problem.curve).seen_from(
-            self.surface, 0.0, shifts
+        fit = self.fit
+        planes = None if not fit.shifting or scan.slices is None else fit.inputs.get("slices")
+        scene = make_scene(scan, self.surface, planes)
+        look = look_at(fit.model, fit.y, scene, fit.settings.loss)
+        rms, robust_rms = (
+            np.append(values[:-1], float(new))
+            for values, new in ((fit.rms, look.rms), (fit.robust_rms, look.robust_rms))
         )
-        return FitResult(
-            control=self.control,
-            scheme=self.scheme,
-            surface=self.surface,
-            scan=scan,
-            rms=np.append(self.rms[:-1], float(seen.rms)),
-            robust_rms=np.append(self.robust_rms[:-1], float(seen.robust_rms)),
-            result=self.result,
-            problem=self._problem,
-            seen=seen,
-            recipe=self.recipe,
-            start=self.start,
-            shifts=shifts,
-        )
+        again = dataclasses.replace(fit, scene=scene, look=look, scan=scan, rms=rms, robust_rms=robust_rms)
+        return FitResult(again, recipe=self.recipe)
 
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Write the fit into a folder, made where there is none, for `fitting.load`; and its settings.
@@ -175,7 +143,7 @@ class FitResult:
     @property
     def points(self) -> Float[np.ndarray, "p 3"]:
         """The scan's points, moved by the shifts of their slices, in mm."""
-        return np.asarray(self._seen.pairs.points)
+        return np.asarray(self.fit.look.pairs.points)
 
     @property
     def inliers(self) -> Bool[np.ndarray, "p"]:
@@ -187,12 +155,12 @@ class FitResult:
         Args:
             uncertainty: with that of the surface, which takes a second or more.
         """
-        areas, to_scan = vertex_areas(self.surface), distances_to_scan(self.surface, self._seen, self.inliers)
+        areas, to_scan = vertex_areas(self.surface), distances_to_scan(self.surface, self.fit.look, self.inliers)
         covered = ~np.isnan(to_scan)
         areas_there, away = areas[covered], np.abs(to_scan[covered])
         known, share = bool(areas_there.sum() > 0), areas_there / max(areas_there.sum(), np.finfo(float).tiny)
         spread = self.uncertainty().surface[covered] if uncertainty and known else None
-        edge = float(js.edge_length(self._problem.topology, self.control.vertices))
+        edge = float(js.edge_length(self.fit.topology, self.control.vertices))
         return Report(
             converged=bool(self.result == optx.RESULTS.successful),
             reason=_words(self.result),
@@ -218,17 +186,24 @@ class FitResult:
             rms_to_scan=float(np.sqrt(share @ away**2)) if known else None,
             percentile_95_to_scan=weighted_quantile(away, share, 0.95) if known else None,
             maximum_to_scan=float(away.max()) if known else None,
-            n_unknowns=int(self._problem.is_free.sum()) + 2 * len(self.slices),
-            determined=self._problem.determined,
+            n_unknowns=_count_unknowns(self.fit),
+            determined=float(self.fit.strengths.determined),
             least_margin=float(js.admissible_margin(self.control_mesh).min()) if self.scheme.uses_normals else None,
             uncertainty_median=None if spread is None else weighted_quantile(spread, share, 0.5),
             uncertainty_95=None if spread is None else weighted_quantile(spread, share, 0.95),
             shifts=[SliceShift(int(i), shift.tolist()) for i, shift in zip(self.slices, self.shifts, strict=True)],
             worst=[
                 WorstPlace(place.position.tolist(), place.distance, place.n_points)
-                for place in worst_places(self.surface, self._seen, self.distances, edge)
+                for place in worst_places(self.surface, self.fit.look, self.distances, edge)
             ],
         )
+
+
+def _count_unknowns(fit: Fit) -> int:
+    """Numbers that the fit was free to change, and that last."""
+    shared = [of for name, of in fit.model.layout.shared if of.lasting and (fit.shifting or name != "shifts")]
+    own = np.asarray(fit.model.is_free)[: fit.model.layout.n_own].sum()
+    return int(own) + sum(math.prod(of.shape) for of in shared)
 
 
 def _rms(distances: Float[np.ndarray, "p"]) -> float:

@@ -6,106 +6,99 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array
 
 import jaxsubdiv as js
-from jaxsubdiv import corner_weights
 from jaxsubdiv.files import replacing
 
-from ..model.pairing import Look
+from ..model.pairing import Look, make_scene
 from ..model.priors.boundary import BoundaryCurve
-from ..model.priors.shifts import find_shifts
+from ..model.priors.landmarks import Anchors
+from ..model.priors.shifts import find_slice_planes
 from ..model.priors.symmetry import symmetry_of
-from ..model.recipe import Recipe
-from ..model.residual import Anchors, Expected, Pairs
+from ..model.recipe import Settings
+from ..model.residual import Pairs, analyse
+from ..model.unknowns import Variables
 from ..scan.scan import Scan
-from ..solve.problem import Found, Problem
-from .result import FitResult
+from ..solve.strengths import Strengths
+from ..solve.sweeps import shift_points
+from .record import Fit
 
-_VERSION = 3  # 1 had no likeness, 2 not what held the unknowns
+_VERSIONS = (3, 4)  # 1 had no likeness, 2 not what held the unknowns; 4 has strengths and shared unknowns by name
 _FIT, _RECIPE = "fit.npz", "recipe.json"
 _ENDS = ("successful", "nonlinear_max_steps_reached", "nonlinear_divergence", "nonfinite")
 _A_POINT = ("face", "uv", "directions", "distances", "weights", "precisions")
 
 
-def save(folder: str | os.PathLike[str], result: FitResult) -> None:
-    """Write `fit.npz`, all that `load` needs, and `recipe.json`, the settings in words; see `FitResult.save`."""
-    recipe, start, problem, seen, scan = result.recipe, result.start, result._problem, result._seen, result.scan
-    if recipe is None or start is None:
-        raise ValueError("this fit does not know its settings: only what `fit` returned can be saved.")
-    text, found, topology = recipe.to_json(), problem.found(), problem.topology
-    again = recipe.topology(js.ControlMesh(found.template, topology.control_faces))
+def save_fit(folder: str | os.PathLike[str], fit: Fit, recipe: Settings) -> None:
+    """Write `fit.npz`, all that `load_fit` needs, and `recipe.json`, the settings in words; see `FitResult.save`."""
+    text, topology, look = recipe.to_json(), fit.topology, fit.look
+    own = fit.settings.to_json()
+    again = fit.settings.topology(js.ControlMesh(fit.model.template, topology.control_faces))
     if not eqx.tree_equal(again, topology):
         raise ValueError(
             "the fit's topology is not what `build_topology` makes of its control faces: fits with creases cannot be "
             "saved yet. Write the control mesh with `js.write_mesh(path, result.control_mesh)`."
         )
     arrays: dict[str, Any] = {
-        "version": _VERSION,
+        "version": _VERSIONS[-1],
         "recipe": text,
-        "result": next(name for name in _ENDS if bool(result.result == getattr(optx.RESULTS, name))),
-        "control_vertices": result.control.vertices,
-        "control_normals": result.control.normals,
-        "start_normals": start.normals,
-        "template": found.template,
-        "bend_precision": found.bend_precision,
-        "likeness": found.likeness,
-        "determined": found.determined,
-        "annealed": found.annealed,
-        "hold": found.hold,
+        "settings": own,
+        "result": next(name for name in _ENDS if bool(fit.result == getattr(optx.RESULTS, name))),
+        "control_vertices": fit.y.control.vertices,
+        "control_normals": fit.y.control.normals,
+        "start_normals": fit.start.normals,
+        "template": fit.model.template,
+        "determined": fit.strengths.determined,
+        "annealed": fit.strengths.annealed,
+        "hold": fit.hold,
+        "shifting": fit.shifting,
         "triangles": topology.control_faces[3],
         "quads": topology.control_faces[4],
-        "face": seen.at.face,
-        "uv": seen.at.uv,
-        "directions": seen.pairs.directions,
-        "distances": seen.distances,
-        "weights": seen.weights,
-        "precisions": seen.precisions,
-        "noise": seen.noise,
-        "scale": seen.scale,
-        "rms": result.rms,
-        "robust_rms": result.robust_rms,
+        "face": look.at.face,
+        "uv": look.at.uv,
+        "directions": look.pairs.directions,
+        "distances": look.distances,
+        "weights": look.weights,
+        "precisions": look.precisions,
+        "noise": look.noise,
+        "scale": look.scale,
+        "rms": fit.rms,
+        "robust_rms": fit.robust_rms,
     }
-    arrays |= {f"expected_{name}": value for name, value in found.expected._asdict().items()}
-    optional = {"h": result.scheme.h} | {f"scan_{name}": value for name, value in vars(scan).items()}
-    if result._shifts is not None:
-        optional |= {"slices": result.slices, "shifts": result.shifts}
-    if found.anchors is not None:
-        optional |= {f"anchor_{name}": value for name, value in found.anchors._asdict().items()}
-    if found.symmetry is not None:
-        optional |= {"symmetry_partner": found.symmetry.partner}
-    if found.curve is not None:
-        optional |= {"boundary_points": found.curve.points, "boundary_deviation": found.curve.deviation}
-    arrays |= {name: value for name, value in optional.items() if value is not None}
+    arrays |= {f"strength_{name}": value for name, value in fit.strengths.values.items()}
+    arrays |= {f"shared_{name}": value for name, value in fit.y.shared.items()}
+    for name, value in vars(fit.scan).items():
+        arrays[f"scan_{name}"] = value
+    inputs = fit.inputs
+    arrays["alike"] = inputs.get("alike")
+    if inputs.get("landmarks") is not None:
+        arrays |= {f"anchor_{name}": value for name, value in inputs["landmarks"]._asdict().items()}
+    if inputs.get("symmetry") is not None:
+        arrays["symmetry_partner"] = inputs["symmetry"].partner
+    if inputs.get("boundary") is not None:
+        arrays |= {f"boundary_{name}": value for name, value in inputs["boundary"]._asdict().items()}
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with replacing(folder / _FIT) as path:
-        as_numpy: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
+        as_numpy: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items() if value is not None}
         np.savez(path, **as_numpy)
     with replacing(folder / _RECIPE) as path:
         path.write_text(text + "\n", encoding="utf-8")
 
 
-def load(folder: str | os.PathLike[str]) -> FitResult:
-    """The fit that `FitResult.save` wrote into a folder, with its report, its uncertainty and its refit.
-
-    Numbers come in JAX's default floating dtype. `recipe.json` is not read; it is for fits of other scans.
-
-    Args:
-        folder: the one that was saved to.
-
-    Raises:
-        FileNotFoundError: there is no saved fit in the folder.
-        ValueError: the file is damaged, incomplete or of a later version; the text names it and says what is wrong.
-    """
+def load_fit(folder: str | os.PathLike[str]) -> tuple[Fit, str]:
+    """The fit that `save_fit` wrote into a folder, and its recipe as JSON text; see `fitting.load`."""
     path = Path(folder) / _FIT
     if not path.is_file():
         raise FileNotFoundError(f"{folder} has no {_FIT}: it is not the folder of a fit that was saved.")
     try:
-        return _restored(_read(path))
+        arrays = _read(path)
+        return _restore(arrays), str(arrays["recipe"])
     except KeyError as error:
         raise ValueError(f"{path}: {error.args[0]!r} is missing: the file is not one of a saved fit.") from None
     except (ValueError, TypeError, IndexError, EOFError, zipfile.BadZipFile) as error:
@@ -116,47 +109,78 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
         arrays = dict(file)
     version = int(arrays["version"])
-    if version != _VERSION:
-        what = "Update it" if version > _VERSION else f"Fit the scan again, by its {_RECIPE}"
-        raise ValueError(f"a fit of version {version}, but this release reads version {_VERSION}. {what}.")
+    if version not in _VERSIONS:
+        what = "Update it" if version > _VERSIONS[-1] else f"Fit the scan again, by its {_RECIPE}"
+        raise ValueError(f"a fit of version {version}, but this release reads version {_VERSIONS[-1]}. {what}.")
     n = len(arrays["scan_points"])
     for name in _A_POINT:
         if len(arrays[name]) != n:
             raise ValueError(f"{name!r} has {len(arrays[name])} rows for {n} scan points.")
+    return arrays if version == _VERSIONS[-1] else _update(arrays)
+
+
+def _update(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of version 3 as those of version 4."""
+    arrays = dict(arrays)
+    precision, n_faces = arrays.pop("bend_precision"), len(arrays["triangles"]) + len(arrays["quads"])
+    arrays |= {"settings": arrays["recipe"], "strength_bend": precision[:n_faces]}
+    arrays["strength_likeness"] = arrays.pop("likeness")
+    if len(arrays["expected_rows"]):
+        arrays["strength_height"] = precision[n_faces:]
+    if "h" in arrays:
+        arrays["shared_h"] = arrays.pop("h")
+    arrays["shifting"] = np.asarray("shifts" in arrays)
     return arrays
 
 
-def _restored(arrays: dict[str, np.ndarray]) -> FitResult:
+def _restore(arrays: dict[str, np.ndarray]) -> Fit:
     def on_device(name: str) -> Array:
         values = arrays[name]
         return jnp.asarray(values, jnp.result_type(float) if values.dtype.kind == "f" else None)
 
-    recipe = Recipe.from_json(str(arrays["recipe"]))
-    scheme = recipe.scheme
-    if scheme.h is not None:
-        scheme = eqx.tree_at(lambda s: s.h, scheme, on_device("h"))
-    topology = recipe.topology(js.ControlMesh(arrays["template"], {3: arrays["triangles"], 4: arrays["quads"]}))
-    control = js.Control(on_device("control_vertices"), on_device("control_normals"))
+    settings = Settings.from_json(str(arrays["settings"]))
+    scheme = settings.scheme
+    topology = settings.topology(js.ControlMesh(arrays["template"], {3: arrays["triangles"], 4: arrays["quads"]}))
     start = js.Control(on_device("template"), on_device("start_normals"))
-    surface = js.refine(scheme, topology, control)
+    of_scan = ("points", "normals", "weights", "deviations", "slices")
+    scan = Scan(**{name: arrays.get(f"scan_{name}") for name in of_scan})
+    inputs: dict[str, Any] = {"alike": arrays.get("alike")}
+    if "anchor_points" in arrays:
+        inputs["landmarks"] = Anchors(*(on_device(f"anchor_{name}") for name in Anchors._fields))
+    if "symmetry_partner" in arrays:
+        inputs["symmetry"] = symmetry_of(arrays["symmetry_partner"], arrays["template"])
+    if "boundary_points" in arrays:
+        inputs["boundary"] = BoundaryCurve(arrays["boundary_points"], float(arrays["boundary_deviation"]))
+    if settings.free.shifts:
+        inputs["slices"] = find_slice_planes(scan)
+    model, first = analyse(scheme, topology, start, settings.free, settings.priors, inputs)
+    shared = {
+        name: on_device(f"shared_{name}") if f"shared_{name}" in arrays else value
+        for name, value in first.shared.items()
+    }
+    y = Variables(js.Control(on_device("control_vertices"), on_device("control_normals")), shared)
+    if "h" not in y.shared and scheme.h is not None and "shared_h" in arrays:
+        model = eqx.tree_at(lambda one: one.scheme.h, model, on_device("shared_h"))
+    if "shifts" in arrays:  # of version 3, as vectors
+        planes = inputs.get("slices")
+        if planes is None or not np.array_equal(planes.numbers, arrays["slices"]):
+            raise ValueError("'slices' are not those of the scan that may move.")
+        within = np.einsum("sx,sjx->sj", arrays["shifts"], planes.planes)
+        y.shared["shifts"] = jnp.asarray(within)
+    surface = model.refine(y)
     face = arrays["face"]
     if not ((face >= 0) & (face < surface.n_faces)).all():
         raise ValueError(f"'face' has rows of faces that there are not; the surface has {surface.n_faces}.")
-
-    of_scan = ("points", "normals", "weights", "deviations", "slices")
-    scan = Scan(**{name: arrays.get(f"scan_{name}") for name in of_scan})
-    shifts = None
-    if "shifts" in arrays:
-        shifts = find_shifts(scan)
-        if shifts is None or not np.array_equal(shifts.slices, arrays["slices"]):
-            raise ValueError("'slices' are not those of the scan that may move.")
-        shifts = shifts.at(arrays["shifts"])
-    points = scan.points if shifts is None else shifts.put_on(scan).points
+    shifting = bool(arrays["shifting"])
+    scene = make_scene(scan, surface, inputs.get("slices"))
+    points = scan.points
+    if shifting and scene.of_points is not None:
+        points = points + shift_points(model, y.shared["shifts"], scene.of_points).astype(points.dtype)
     at = js.SurfacePoint(face, on_device("uv"))
     rms, robust_rms = arrays["rms"], arrays["robust_rms"]
-    seen = Look(
+    look = Look(
         at=at,
-        pairs=Pairs(points, *corner_weights(surface, at), on_device("directions")),
+        pairs=Pairs(points, *js.corner_weights(surface, at), on_device("directions")),
         distances=on_device("distances"),
         weights=on_device("weights"),
         precisions=on_device("precisions"),
@@ -165,31 +189,23 @@ def _restored(arrays: dict[str, np.ndarray]) -> FitResult:
         rms=jnp.asarray(rms[-1], jnp.result_type(float)),
         robust_rms=jnp.asarray(robust_rms[-1], jnp.result_type(float)),
     )
-    anchors = None
-    if "anchor_points" in arrays:
-        anchors = Anchors(*(on_device(f"anchor_{name}") for name in Anchors._fields))
-    symmetry = None
-    if "symmetry_partner" in arrays:
-        symmetry = symmetry_of(arrays["symmetry_partner"], arrays["template"])
-    curve = None
-    if "boundary_points" in arrays:
-        curve = BoundaryCurve(arrays["boundary_points"], float(arrays["boundary_deviation"]))
-    problem = Problem(recipe.scheme, topology, start, recipe.free, recipe.priors, anchors, symmetry, curve)
-    expected = Expected(*(arrays[f"expected_{name}"] for name in Expected._fields))
-    of_bends = arrays["bend_precision"], expected, float(arrays["likeness"])
-    of_sweeps = float(arrays["determined"]), bool(arrays["annealed"]), arrays["hold"]
-    problem.tell(Found(arrays["template"], *of_bends, *of_sweeps, anchors))
-    return FitResult(
-        control=control,
-        scheme=scheme,
-        surface=surface,
+    values = {prior.name: arrays[f"strength_{prior.name}"] for prior in model.priors if prior.n_strengths}
+    values["likeness"] = arrays["strength_likeness"]
+    hold = np.zeros(model.layout.n)
+    hold[: len(arrays["hold"])] = arrays["hold"]
+    return Fit(
+        model=model,
+        y=y,
+        scene=scene,
+        look=jax.tree.map(np.asarray, look),
+        strengths=Strengths(values, np.asarray(arrays["determined"]), np.asarray(arrays["annealed"])),
+        hold=hold,
+        shifting=shifting,
         scan=scan,
+        start=start,
+        inputs=inputs,
+        settings=settings,
         rms=rms,
         robust_rms=robust_rms,
         result=getattr(optx.RESULTS, str(arrays["result"])),
-        problem=problem,
-        seen=seen,
-        recipe=recipe,
-        start=start,
-        shifts=shifts,
     )

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jaxsubdiv as js
@@ -58,9 +59,25 @@ class Checkpoint:
         with replacing(self.path) as path, open(path, "wb") as file:
             np.savez(file, **whole)  # pyright: ignore[reportArgumentType]
 
+    def read_tree(self, like: Any) -> Any:
+        """The pytree last written, in the structure of another; None where there is no file."""
+        arrays = self.read()
+        if arrays is None:
+            return None
+        leaves, structure = jax.tree.flatten(like)
+        return jax.tree.unflatten(structure, [_as(arrays[f"leaf {i}"], leaf) for i, leaf in enumerate(leaves)])
+
+    def write_tree(self, tree: Any) -> None:
+        """Take the place of what was written before by the leaves of a pytree."""
+        self.write({f"leaf {i}": leaf for i, leaf in enumerate(jax.tree.leaves(tree))})
+
     def remove(self) -> None:
         """The run has ended, or is to be forgotten."""
         self.path.unlink(missing_ok=True)
+
+
+def _as(array: np.ndarray, leaf: Any) -> Any:
+    return jnp.asarray(array) if isinstance(leaf, jax.Array) else array
 
 
 def _mark(value: Any) -> str:

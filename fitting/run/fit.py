@@ -1,10 +1,10 @@
-"""`fit`: pairing on the host, derivatives on the device and a sparse solution on the host, in turns."""
+"""`fit`: steps the solver `Sweeps` until the surface has come to rest, with progress and checkpoints."""
 
 import os
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -14,34 +14,37 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 import jaxsubdiv as js
-from jaxsubdiv import corner_weights
-from jaxsubdiv.linalg import dot, unit
+from jaxsubdiv.linalg import unit
 
-from ..model.pairing import Look
+from ..model.pairing import Scene, make_scene
+from ..model.priors import Priors
 from ..model.priors.boundary import BoundaryCurve, checked_curve
-from ..model.priors.shifts import find_shifts
+from ..model.priors.landmarks import anchor_landmarks
+from ..model.priors.shifts import find_slice_planes
 from ..model.priors.symmetry import Symmetry, find_symmetry, symmetry_of
-from ..model.recipe import Recipe
-from ..model.residual import Anchors, Priors
+from ..model.recipe import Settings
+from ..model.residual import Model, analyse
 from ..model.robust import AbstractLoss, geman_mcclure
-from ..model.unknowns import Free, apply_offset
-from ..model.view import View
+from ..model.unknowns import Free, Variables
+from ..report.record import Fit
 from ..report.result import FitResult
-from ..scan.closest_points import closest_points
-from ..scan.landmarks import Landmarks, place_landmarks
+from ..scan.landmarks import Landmarks
 from ..scan.scan import Scan, ScanError
-from ..solve.problem import Memory, Problem
-from ..start.folds import unfolded_start
+from ..solve.conjugate_gradients import ConjugateGradients
+from ..solve.sparse_normal import SparseNormal, find_structure
+from ..solve.strengths import FromScan, first_strengths
+from ..solve.sweeps import State, Subject, Sweeps, hold_priors, subject_residual
+from ..start.folds import Folds, unfolded_start
 from .checkpoint import Checkpoint
 
+LinearSolver: TypeAlias = Literal["sparse", "conjugate gradients"]
+
+_TIGHT, _MOST_STEPS = 1e-4, 1000  # of conjugate gradients, where one fit is to come to the host's surface
 # A start that is off by more than this part of the control mesh's size is not roughly aligned.
 _FAR = 0.05
 # Scans in metres against a mesh in mm differ by 1000; a partial scan of the anatomy by much less than this.
 _UNIT_RATIO = 20.0
-# Movements far below a control edge are at rest, however exact the scan.
-AT_REST = 0.01
 _LEAST_MARGIN = 0.05  # of a control normal at the start; see `js.admissible_margin`
-_MOST = 0.9  # of the surface: so much of it has to be at rest
 CHECKPOINT = "checkpoint.npz"
 
 
@@ -69,6 +72,7 @@ def fit(
     symmetry: Symmetry | None = None,
     boundary: BoundaryCurve | None = None,
     alike: Bool[np.ndarray, "f"] | None = None,
+    linear_solver: LinearSolver | None = None,
     max_sweeps: int = 60,
     tolerance: float = 0.1,
     throw: bool = True,
@@ -103,6 +107,8 @@ def fit(
             points beyond it do not count.
         alike: control faces whose shape where the fit starts says what to expect, see `Priors.likeness`; triangles
             first. Default: all.
+        linear_solver: "sparse" solves the normal equations of each sweep on the host, "conjugate gradients" pairs and
+            solves where JAX computes; default: "sparse" on the CPU, else the other. Both come to the same surface.
         max_sweeps: how many sweeps at most.
         tolerance: converged once a sweep, annealed, moves nine tenths of the surface, and the RMS distance, by less
             than this part of the surface's uncertainty, which is about noise / sqrt(points a control vertex); or of a
@@ -124,82 +130,44 @@ def fit(
     check(scheme, topology, control, scan)
     # Made here and not in the signature: arrays made while a module loads would settle JAX's device and precision.
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
-    symmetry = _partners(symmetry, priors, topology, control)
+    symmetry = find_partners(symmetry, priors, topology, control)
     if alike is not None and alike.shape != (topology.n_control_faces,):
         n_faces = topology.n_control_faces
         raise ValueError(f"`alike` must say it of each of the {n_faces} control faces; got {list(alike.shape)}.")
     control = sound_start(scheme, topology, control, free)
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
     settings["landmark_deviation"] = landmark_deviation
-    recipe = Recipe.of(scheme, topology, **settings)
     given = {"scheme": scheme, "topology": topology, "control": control, "scan": scan, "landmarks": landmarks}
-    given |= {"symmetry": symmetry, "boundary": boundary, "alike": alike}
+    given |= {"symmetry": symmetry, "boundary": boundary, "alike": alike, "solver": linear_solver}
     kept = None if checkpoint is None else Checkpoint(Path(checkpoint) / CHECKPOINT, given | settings)
-    before = None if kept is None else kept.read()
-    start = control
-    surface = js.refine(scheme, topology, control)
-    edge = float(js.edge_length(topology, control.vertices))
-    curve = None if boundary is None else checked_curve(boundary, topology)
-    view = View(scan, surface, edge, loss, curve)
-    seen = view.seen_from(surface)
-    widest = float(seen.scale)  # a robust scale of the start's own error: outliers must not widen it
-    _warn_if_far(float(np.median(np.abs(seen.distances))), control)
-    rms, robust_rms, result = [float(seen.rms)], [float(seen.robust_rms)], optx.RESULTS.nonlinear_max_steps_reached
-    anchors = None if landmarks is None else _anchors(landmarks, landmark_deviation, topology, control, surface)
-    problem = Problem(scheme, topology, control, free, priors, anchors, symmetry, curve, alike)
-    waiting, shifts = find_shifts(scan) if free.shifts else None, None
-    if before is not None:
-        scheme, control, rms, robust_rms = _recalled(before, problem, scheme, control)
-        if waiting is not None and "within" in before:
-            waiting, shifts = None, waiting.recalled(before)
-        surface = js.refine(scheme, topology, control)
-        seen = view.seen_from(surface, _floor(widest, len(rms) - 1), shifts)
-    for sweep in range(len(rms) - 1, max_sweeps):
-        step, shifted = problem.step(scheme, control, seen, shifts)
-        proposed = _apply(topology, scheme, control, step)
-        refined = js.refine(proposed[0], topology, proposed[1])
-        if not np.isfinite(refined.vertices).all():
-            result = optx.RESULTS.nonfinite  # what the last sound sweep found is what comes back
-            break
-        moved = float(surface_moved(surface, refined))
-        (scheme, control), surface, shifts = proposed, refined, shifted
-        floor = _floor(widest, sweep + 1)
-        seen = view.seen_from(surface, floor, shifts)
-        rms.append(float(seen.rms))
-        robust_rms.append(float(seen.robust_rms))
-        if on_sweep is not None:
-            on_sweep(Sweep(sweep + 1, robust_rms[-1], moved))
-        at_noise = floor <= max(float(seen.noise), view.least_scale)
-        annealed = problem.annealed and at_noise and waiting is None
-        at_rest = tolerance * max(_uncertainty(seen, control), AT_REST * edge)
-        if annealed and max(moved, abs(robust_rms[-1] - robust_rms[-2])) <= at_rest:
-            result = optx.RESULTS.successful
-            break
-        if waiting is not None and at_noise:
-            # Not before, where the start is off and everything would be taken for shifts; nor when the surface has come
-            # to rest, for it has bent to the slices that are off.
-            waiting, shifts = None, waiting
-        if kept is not None:
-            now = {"vertices": control.vertices, "normals": control.normals, "h": scheme.h}
-            now |= {} if shifts is None else shifts.memory()
-            kept.write(now | {"rms": rms, "robust_rms": robust_rms} | problem.memory()._asdict())
+    inputs = gather_inputs(scheme, topology, control, scan, free, landmarks, landmark_deviation, boundary)
+    inputs |= {"symmetry": symmetry, "alike": alike}
+    model, y = analyse(scheme, topology, control, free, priors, inputs)
+    scene = make_scene(scan, model.refine(y), inputs["slices"])
+    solver = make_solver(model, y, scene, linear_solver, loss, tolerance, max_sweeps)
+    subject, nothing = Subject(model, scene), frozenset()
+    state = solver.init(subject_residual, y, subject, {}, None, None, nothing)
+    if kept is not None and (before := kept.read_tree((y, state))) is not None:
+        y, state = before
+    done, result = False, optx.RESULTS.successful
+    while not done:
+        k = int(state.sweep)
+        moved = float(state.moved)
+        y, state, _ = solver.step(subject_residual, y, subject, {}, state, nothing)
+        done, result = solver.terminate(subject_residual, y, subject, {}, state, nothing)
+        if k == 0:
+            _warn_if_far(float(np.median(np.abs(state.look.distances))), control)
+        elif on_sweep is not None:
+            on_sweep(Sweep(k, float(state.robust_rms[k]), moved))
+        if kept is not None and not done:
+            kept.write_tree((y, state))
     if kept is not None:
         kept.remove()
     found = FitResult(
-        control=control,
-        scheme=scheme,
-        surface=surface,
-        scan=scan,
-        rms=np.array(rms),
-        robust_rms=np.array(robust_rms),
-        result=result,
-        problem=problem,
-        seen=seen,
-        recipe=recipe,
-        start=start,
-        shifts=shifts,
+        record_fit(model, y, state, scene, scan, control, inputs, Settings.of(scheme, topology, **settings), result)
     )
     if throw and result != optx.RESULTS.successful:
+        rms = found.rms
         raise RuntimeError(
             f"the fit did not converge in {len(rms) - 1} sweeps (RMS {rms[0]:.3f} -> {rms[-1]:.3f} mm): "
             f"{found.report().reason}. Give more `max_sweeps`, a better start, or throw=False to get what there is."
@@ -207,29 +175,83 @@ def fit(
     return found
 
 
-_apply = eqx.filter_jit(apply_offset)
+def make_solver(
+    model: Model,
+    y: Variables,
+    scene: Scene,
+    linear_solver: LinearSolver | None,
+    loss: AbstractLoss,
+    tolerance: float,
+    max_sweeps: int,
+) -> Sweeps:
+    """The solver of a fit whose strengths follow from the scan."""
+    if linear_solver is None:
+        linear_solver = "sparse" if jax.default_backend() == "cpu" else "conjugate gradients"
+    if linear_solver == "sparse":
+        held, _ = hold_priors(model, y, model.refine(y), first_strengths(model).values, scene)
+        solver = SparseNormal(find_structure(model, y, held)[0])
+    else:
+        solver = ConjugateGradients(_TIGHT, _MOST_STEPS)
+    tables = Folds(model.topology)
+    return Sweeps(solver, FromScan(), loss, tolerance, max_sweeps, tables)
 
 
-def _floor(widest: float, sweep: int) -> float:
-    """Least scale of the loss after a sweep: half of what it was after the one before."""
-    return widest * 0.5**sweep
+def gather_inputs(
+    scheme: js.AbstractScheme,
+    topology: js.Topology,
+    control: js.Control,
+    scan: Scan,
+    free: Free,
+    landmarks: Landmarks | None,
+    landmark_deviation: float,
+    boundary: BoundaryCurve | None,
+) -> dict[str, Any]:
+    """What belongs to one scan alone, checked; see `Start.inputs`."""
+    surface = js.refine(scheme, topology, control)
+    return {
+        "landmarks": None
+        if landmarks is None
+        else anchor_landmarks(landmarks, landmark_deviation, topology, control, surface),
+        "boundary": None if boundary is None else checked_curve(boundary, topology),
+        "slices": find_slice_planes(scan) if free.shifts else None,
+    }
 
 
-def _recalled(
-    before: dict[str, np.ndarray], problem: Problem, scheme: js.AbstractScheme, control: js.Control
-) -> tuple[js.AbstractScheme, js.Control, list[float], list[float]]:
-    """Scheme, control and RMS distances of a fit that was stopped; its problem takes up what it knew."""
-    memory = Memory._make(before[name] for name in Memory._fields)
-    numbers = {"likeness": float(memory.likeness), "determined": float(memory.determined)}
-    memory = memory._replace(**numbers, annealed=bool(memory.annealed))
-    problem.recall(memory, scheme, control)
-    if scheme.h is not None:
-        scheme = eqx.tree_at(lambda s: s.h, scheme, jnp.asarray(before["h"]))
-    control = js.Control(jnp.asarray(before["vertices"]), jnp.asarray(before["normals"]))
-    return scheme, control, before["rms"].tolist(), before["robust_rms"].tolist()
+def record_fit(
+    model: Model,
+    y: Variables,
+    state: State,
+    scene: Scene,
+    scan: Scan,
+    start: js.Control,
+    inputs: dict[str, Any],
+    settings: Settings,
+    result: optx.RESULTS,
+) -> Fit:
+    """What a solver found, as data on the host."""
+    state = jax.tree.map(np.asarray, state)
+    n = int(state.sweep)
+    return Fit(
+        model=model,
+        y=y,
+        scene=scene,
+        look=state.look,
+        strengths=state.strengths,
+        hold=state.damping.hold,
+        shifting=bool(state.shifting),
+        scan=scan,
+        start=start,
+        inputs=inputs,
+        settings=settings,
+        rms=state.rms[:n],
+        robust_rms=state.robust_rms[:n],
+        result=result,
+    )
 
 
-def _partners(symmetry: Symmetry | None, priors: Priors, topology: js.Topology, control: js.Control) -> Symmetry | None:
+def find_partners(
+    symmetry: Symmetry | None, priors: Priors, topology: js.Topology, control: js.Control
+) -> Symmetry | None:
     """Those that the prior ties, where there is one."""
     if not np.isfinite(priors.symmetry):
         if symmetry is not None:
@@ -240,42 +262,10 @@ def _partners(symmetry: Symmetry | None, priors: Priors, topology: js.Topology, 
     return symmetry_of(symmetry.partner, np.asarray(control.vertices))
 
 
-@eqx.filter_jit
-def surface_moved(before: js.RefinedSurface, after: js.RefinedSurface) -> Float[Array, ""]:
-    """How far a surface moved across itself: nine tenths of its vertices by less than this.
-
-    The rest may be where the control mesh is too coarse for the scan, and points change sides for ever.
-    """
-    return jnp.quantile(jnp.abs(dot(after.normals, after.vertices - before.vertices)), _MOST)
-
-
-def _uncertainty(seen: Look, control: js.Control) -> float:
-    """About how well the scan determines the surface, in mm."""
-    counted = max(float(np.sum(np.asarray(seen.weights) > 0)), 1.0)
-    return float(seen.scale) * (control.vertices.shape[0] / counted) ** 0.5
-
-
-def _anchors(
-    landmarks: Landmarks,
-    deviation: float,
-    topology: js.Topology,
-    control: js.Control,
-    surface: js.RefinedSurface,
-) -> Anchors:
-    """Landmarks at the places of the surface that are closest to theirs on the control mesh."""
-    placed = place_landmarks(landmarks, js.ControlMesh(control.vertices, topology.control_faces, check=False))
-    counted = placed.weights > 0
-    at = closest_points(surface, placed.mesh[counted])
-    corners, weights = corner_weights(surface, at)
-    dtype = control.vertices.dtype
-    points = jnp.asarray(placed.scan[counted], dtype)
-    deviations = jnp.asarray(deviation / np.sqrt(placed.weights[counted]), dtype)
-    return Anchors(points, at.face, corners, weights, deviations)
-
-
 def sound_start(scheme: js.AbstractScheme, topology: js.Topology, control: js.Control, free: Free) -> js.Control:
     """The control mesh without faces upside down, with unit normals that fold nothing."""
-    control = unfolded_start(scheme, topology, control, free)
+    may_move = free.masks(scheme, topology.n_control_vertices)["vertices"]
+    control = unfolded_start(topology, control, may_move)
     return js.Control(control.vertices, given_normals(topology, control))
 
 

@@ -14,9 +14,9 @@ from scipy.spatial import KDTree
 
 import jaxsubdiv as js
 
+from ..model.priors import Priors
 from ..model.priors.symmetry import Symmetry, find_symmetry
-from ..model.recipe import Recipe
-from ..model.residual import Priors, control_faces_of, splits_in_four
+from ..model.recipe import Settings
 from ..report.result import FitResult
 from ..scan.closest_points import nearest_rows
 from ..scan.landmarks import Landmarks
@@ -65,15 +65,15 @@ def fit_scan(
     mesh: js.ControlMesh | None = None,
     *,
     scheme: js.AbstractScheme | None = None,
-    levels: int = Recipe.levels,
-    faces: int = Recipe.faces,
-    kind: FaceKind = Recipe.kind,
-    closed: bool | None = Recipe.closed,
-    pose: Kind | None = Recipe.pose,
+    levels: int = Settings.levels,
+    faces: int = Settings.faces,
+    kind: FaceKind = Settings.kind,
+    closed: bool | None = Settings.closed,
+    pose: Kind | None = Settings.pose,
     landmarks: Landmarks | None = None,
-    tolerance_mm: float | None = Recipe.tolerance_mm,
-    most_faces: int = Recipe.most_faces,
-    most_points: int | None = Recipe.most_points,
+    tolerance_mm: float | None = Settings.tolerance_mm,
+    most_faces: int = Settings.most_faces,
+    most_points: int | None = Settings.most_points,
     on_stage: Callable[[str], None] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     **options: Any,
@@ -163,7 +163,7 @@ def fit_scan(
             break
         finer = _split(result.scheme, start.mesh, result.control)
         unseen = np.zeros(finer.n_faces, bool)
-        if splits_in_four(result.scheme, topology):
+        if js.splits_in_four(result.scheme, topology):
             unseen = np.repeat(~_has_points(result), 4)
         start = _Start(finer, result.scheme, start.alignment, start.splits + 1, unseen)
     if kept is not None:
@@ -178,8 +178,8 @@ def fit_scan(
 
 def _has_points(result: FitResult) -> Bool[np.ndarray, "f"]:
     """Control faces that the scan has points on."""
-    topology, counted = result._problem.topology, result.inliers & (result.weights > 0)
-    owner = control_faces_of(result.scheme, topology, result.surface, result.control)
+    topology, counted = result.fit.topology, result.inliers & (result.weights > 0)
+    owner = js.control_faces_of(result.scheme, topology, result.surface, result.control)
     return np.bincount(owner[np.asarray(result.at.face)[counted]], minlength=owner.max() + 1) > 0
 
 

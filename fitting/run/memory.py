@@ -2,20 +2,15 @@
 
 import jaxsubdiv as js
 
-from ..report.posterior import DENSE
-
 # Bytes, as `tests/bench/fit_memory.py` measures them: of Python with JAX and what it compiles; of a control vertex,
 # most of it the factors of the normal equations; of a face of the surface; and of a point, as many as are worked on at
 # once, and the others.
 _PROGRAMS, _VERTEX, _FACE = 850e6, 300e3, 3e3
 _POINT, _AT_ONCE, _OTHER_POINT = 1.7e3, 200_000, 250.0
-_COPIES = 4  # of the covariance, where it is kept whole
 
 
 def memory_of_fit(topology: js.Topology, n_points: int) -> float:
     """About how many bytes a process has to have for a fit in float32 and its uncertainty, within a third."""
     n_vertices, n_faces = topology.n_control_vertices, sum(len(faces) for faces in topology.faces.values())
-    n_unknowns = (5 if topology.fans is None else 3) * n_vertices  # only schemes without normals keep fans
-    covariance = _COPIES * 8 * n_unknowns**2 if n_unknowns <= DENSE else 0
     points = _POINT * min(n_points, _AT_ONCE) + _OTHER_POINT * n_points
-    return _PROGRAMS + _VERTEX * n_vertices + _FACE * n_faces + points + covariance
+    return _PROGRAMS + _VERTEX * n_vertices + _FACE * n_faces + points

@@ -9,10 +9,16 @@ from scipy.spatial import KDTree
 from jaxsubdiv import RefinedSurface, SurfacePoint
 from jaxsubdiv.half_edges import half_edges
 
-_FIRST_CANDIDATES = 20  # enough for nearly all points near the surface
-_MORE_CANDIDATES = 4  # times as many, for the points whose closest face is not certain yet
+_GROUP = 4  # triangles that stand in the tree as one: refining replaces a face by four, whose rows follow each other
+_LARGE, _MOST_PARTS = 1.5, 24  # times the usual size: larger triangles stand in the tree in parts, to so many a side
+_SAMPLE = 256  # points that tell how far the others will be
+_SHELL = 0.2  # of their distance, beside the reach of a group: points so different are searched together
 _PAIRS_AT_ONCE = 2_000_000  # bounds the memory to a few hundred MB, however large scan and surface are
-_LARGE, _MOST_PARTS = 1.5, 24  # times the usual size: a larger triangle stands in the tree in parts, to so many a side
+_BLOCK = 8192  # pairs whose numbers fit the processor's cache
+_TINY = np.finfo(float).tiny
+_SLACK = 1e-9  # relative: by so much bounds are wider than rounding could make them wrong
+_ROUNDING = 1e-10  # of squared distances whose parts along and across a normal are subtracted
+_THIN = 1e-8  # squared sine of the angle at a corner: the normals of thinner triangles are not exact to `_ROUNDING`
 _QUAD_STEPS = 3
 
 AnyArray: TypeAlias = Any  # of numpy or of JAX: what is below `triangle_distance` serves `_search` too
@@ -21,26 +27,28 @@ AnyArray: TypeAlias = Any  # of numpy or of JAX: what is below `triangle_distanc
 class _Triangles(NamedTuple):
     """A corner, and the edges from it to the next corner and to the one before, coordinate by coordinate."""
 
-    a: Float[np.ndarray, "3 t"]
-    ab: Float[np.ndarray, "3 t"]
-    ac: Float[np.ndarray, "3 t"]
+    a: Float[np.ndarray, "3 *t"]
+    ab: Float[np.ndarray, "3 *t"]
+    ac: Float[np.ndarray, "3 *t"]
 
 
-class _Centres(NamedTuple):
-    """Middles of the triangles, or of equal parts of the large ones."""
+class _Groups(NamedTuple):
+    """Four triangles each, or one part of a large triangle, in balls."""
 
-    points: Float[np.ndarray, "c 3"]
-    triangle: Int[np.ndarray, "c"]
-    radius: Float[np.ndarray, "c"]
-    """Within which the part lies."""
+    centres: Float[np.ndarray, "g 3"]
+    radii: Float[np.ndarray, "g"]
+    balls: Float[np.ndarray, "16 g"]
+    """Of the members: the middle, in the plane of the triangle, and the radius. Missing ones are infinitely far."""
+    triangles: Int[np.ndarray, "4 g"]
 
 
 def closest_points(surface: RefinedSurface, points: Float[np.ndarray, "p 3"]) -> SurfacePoint:
     """Closest surface point of every point: the face and where in it, not the nearest vertex.
 
-    Triangles are searched exactly: candidates come nearest centre first from a k-d tree, until no face that was not
-    looked at can be nearer. A quad is searched as its two triangles; the place found is then moved to the closest one
-    on the bilinear patch, which `js.evaluate` puts there.
+    Triangles are searched exactly: a triangle near the point bounds its distance, and every triangle that may lie
+    within the bound is looked at. Of triangles that are equally near to rounding it is the first: the result does not
+    depend on the other points or on the number of threads. A quad is searched as its two triangles; the place found is
+    then moved to the closest one on the bilinear patch, which `js.evaluate` puts there.
 
     Args:
         surface: values on the host or on the device.
@@ -48,7 +56,8 @@ def closest_points(surface: RefinedSurface, points: Float[np.ndarray, "p 3"]) ->
     """
     vertices = np.asarray(surface.vertices, np.float64)
     points = np.asarray(points, np.float64)
-    a, b, c = (vertices[column].T for column in np.asarray(surface.triangles()).T)
+    by_coordinate = np.ascontiguousarray(vertices.T)
+    a, b, c = (np.take(by_coordinate, column, axis=1) for column in np.asarray(surface.triangles()).T)
     triangle, uv = _nearest_triangle(_Triangles(a, b - a, c - a), points)
     face, uv = to_faces(len(surface.faces[3]), triangle, uv)
     in_quad = np.flatnonzero(face >= len(surface.faces[3]))
@@ -87,51 +96,206 @@ def nearest_on_segments(
 def _nearest_triangle(
     triangles: _Triangles, points: Float[np.ndarray, "p 3"]
 ) -> tuple[Int[np.ndarray, "p"], Float[np.ndarray, "p 2"]]:
-    centres = _centres(triangles)
-    tree, reach = KDTree(centres.points), float(centres.radius.max())
-    nearest, uv = np.zeros(len(points), np.int64), np.zeros((len(points), 2))
-    squared = np.full(len(points), np.inf)
-    unsure, k = np.arange(len(points)), min(_FIRST_CANDIDATES, len(centres.points))
-    while len(unsure):
-        left = []
-        for rows in np.array_split(unsure, -(-len(unsure) * k // _PAIRS_AT_ONCE)):
-            to_centre, candidates = nearest_rows(tree, points[rows], k)
-            for columns in (slice(0, 1), slice(1, None)):  # the nearest centre's triangle spares most of the others
-                # A part lies within its radius of its centre: what is farther by more is not worth a look.
-                reached = to_centre[:, columns] - centres.radius[candidates[:, columns]]
-                point, column = np.nonzero(reached <= np.sqrt(squared[rows])[:, None])
-                triangle = centres.triangle[candidates[point, columns.start + column]]
-                corner, ab, ac = (values[:, triangle] for values in triangles)
-                found, *places = triangle_distance(corner, ab, ac, points[rows[point]].T)
-                closer = found < squared[rows[point]]
-                best = np.full(len(rows), np.inf)
-                np.minimum.at(best, point[closer], found[closer])
-                first = np.flatnonzero(closer & (found == best[point]))[::-1]  # of equals the first is written last
-                row = rows[point[first]]
-                nearest[row], squared[row] = triangle[first], found[first]
-                uv[row] = np.stack([place[first] for place in places], axis=-1)
-            # Where the last centre is farther than the closest face and the reach, no face was missed.
-            left.append(rows[np.sqrt(squared[rows]) * (1 + 1e-9) + reach > to_centre[:, -1]])
-        unsure = np.concatenate(left) if k < len(centres.points) else np.zeros(0, np.int64)
-        k = min(_MORE_CANDIDATES * k, len(centres.points))
-    return nearest, uv
+    search = _Search(triangles, points)
+    if len(points):
+        everyone = np.arange(len(points))
+        search.look(everyone, search.usual_distance())
+        search.look_around(everyone[~search.found])
+    return search.nearest, search.uv
 
 
-def _centres(triangles: _Triangles) -> _Centres:
-    a, ab, ac = (np.ascontiguousarray(rows.T) for rows in triangles)
+class _Search:
+    """Of the nearest triangles of points: bounds of the distances first, then all triangles within them."""
+
+    def __init__(self, triangles: _Triangles, points: Float[np.ndarray, "p 3"]):
+        self._triangles = _Triangles(*(np.ascontiguousarray(rows) for rows in triangles))
+        self._rows, self._points = points, np.ascontiguousarray(points.T)
+        self._normals, self._groups = _normals(self._triangles), _groups(self._triangles)
+        self._tree = _tree(self._groups.centres)
+        self._reach = float(self._groups.radii.max())
+        a, ab, ac = self._triangles
+        size = max(np.abs(corner).max() for corner in (a, a + ab, a + ac)) + np.abs(self._points).max(axis=0, initial=0)
+        self._rounding = 32 * np.finfo(float).eps * size  # of a distance
+        self._bounds, self._distances = np.full((2, len(points)), np.inf)
+        self.nearest, self.uv = np.zeros(len(points), np.int64), np.zeros((len(points), 2))
+        self.found = np.zeros(len(points), bool)
+
+    def usual_distance(self) -> float:
+        """How far most points are from the surface at most, by a few of them."""
+        rows = _some(np.arange(len(self._rows)))
+        distances = self._bounds_by(rows, self._tree.query(self._rows[rows])[1])
+        most, half = np.quantile(distances, (0.85, 0.5))
+        return float(np.clip(1.5 * most, 0.02 * self._reach, max(2 * self._reach, 1.5 * half)))  # not for outliers
+
+    def look_around(self, rows: Int[np.ndarray, "r"]) -> None:
+        """Find what is nearest to points that may be far away: those about as far together."""
+        for lost in _in_parts(rows[np.isinf(self._bounds[rows])], 1.0):
+            self._bounds[lost] = self._bounds_by(lost, nearest_rows(self._tree, self._rows[lost], 1)[1][:, 0])
+        shells = np.floor(np.log1p(_SHELL * self._bounds[rows] / max(self._reach, _TINY)) / np.log1p(_SHELL))
+        for shell in np.unique(shells):
+            alike = rows[shells == shell]
+            self.look(alike, float(self._bounds[alike].max()))
+
+    def look(self, rows: Int[np.ndarray, "r"], within: float) -> None:
+        """Find what is nearest to the points that are no farther than `within` from the surface."""
+        pairs = float(len(self._groups.radii))
+        if len(rows) * pairs > _PAIRS_AT_ONCE:
+            few = self._rows[_some(rows)]
+            pairs = float(self._tree.query_ball_point(few, within + self._reach, return_length=True).mean())
+        for part in _in_parts(rows, pairs):
+            self._look(part, within)
+
+    def _look(self, rows: Int[np.ndarray, "r"], within: float) -> None:
+        # A triangle that comes within a distance is in a group whose centre is no farther than that and the reach.
+        near = _tree(self._rows[rows]).sparse_distance_matrix(self._tree, within + self._reach, output_type="ndarray")
+        point, group, to_centre = (np.ascontiguousarray(near[name]) for name in ("i", "j", "v"))
+        # The nearest group has a triangle that bounds the distance: mostly the closest one, or one beside it.
+        least, first = np.full(len(rows), np.inf), np.full(len(rows), -1)
+        np.minimum.at(least, point, to_centre)
+        nearest = to_centre == least[point]
+        first[point[nearest]] = group[nearest]
+        reached = np.flatnonzero(first >= 0)
+        row = rows[reached]
+        self._bounds[row] = np.minimum(self._bounds[row], self._bounds_by(row, first[reached]))
+        sure = self._bounds[rows] <= within
+        self.found[rows[sure]] = True
+        bound = np.where(sure, self._bounds[rows], -np.inf)[point]
+        pair = np.flatnonzero(to_centre <= bound + self._groups.radii[group])
+        self._decide(*self._within(rows[point[pair]], group[pair], bound[pair]))
+
+    def _bounds_by(self, rows: Int[np.ndarray, "r"], groups: Int[np.ndarray, "r"]) -> Float[np.ndarray, "r"]:
+        """Distances of points from a triangle of a group each, a little more."""
+        balls = np.take(self._groups.balls, groups, axis=1).reshape(_GROUP, 4, -1)
+        away = balls[:, :3] - np.take(self._points, rows, axis=1)
+        member = _dot(away, away).argmin(axis=0)
+        distances = self._measure(rows, self._groups.triangles[member, groups])[0]
+        return distances * (1 + _SLACK) + 100 * self._rounding[rows]
+
+    def _within(
+        self, rows: Int[np.ndarray, "k"], groups: Int[np.ndarray, "k"], bounds: Float[np.ndarray, "k"]
+    ) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"]]:
+        """Points and triangles: those of the groups that may lie within the bounds."""
+        kept_rows, kept = [rows[:0]], [rows[:0]]
+        for start in range(0, len(rows), _BLOCK):
+            row, group, bound = (values[start : start + _BLOCK] for values in (rows, groups, bounds))
+            points = np.take(self._points, row, axis=1)
+            balls = np.take(self._groups.balls, group, axis=1).reshape(_GROUP, 4, -1)
+            for (*middle, radius), triangle in zip(balls, self._groups.triangles, strict=True):
+                away = np.stack(middle) - points
+                squared = _dot(away, away, 0)
+                hit = np.flatnonzero(squared <= (radius + bound) ** 2)
+                which = triangle[group[hit]]
+                # A triangle lies in the disc that its plane cuts out of the ball.
+                squared = squared[hit]
+                rounding = _ROUNDING * squared
+                above = _dot(np.take(self._normals, which, axis=1), away[:, hit], 0) ** 2
+                beside = np.sqrt(np.maximum(squared - above - rounding, 0)) - radius[hit]
+                to_disc = np.maximum(above - rounding, 0) + np.maximum(beside, 0) ** 2
+                near = to_disc <= bound[hit] ** 2
+                kept_rows.append(row[hit[near]])
+                kept.append(which[near])
+        return np.concatenate(kept_rows), np.concatenate(kept)
+
+    def _decide(self, rows: Int[np.ndarray, "m"], triangles: Int[np.ndarray, "m"]) -> None:
+        distances, u, v = self._measure(rows, triangles)
+        np.minimum.at(self._distances, rows, distances)
+        equal = np.flatnonzero(distances <= self._distances[rows] + self._rounding[rows])
+        row, triangle = rows[equal], triangles[equal]
+        self.nearest[row] = self._triangles.a.shape[1]
+        np.minimum.at(self.nearest, row, triangle)
+        first = equal[triangle == self.nearest[row]]
+        self.uv[rows[first]] = np.stack([u[first], v[first]], axis=1)
+
+    def _measure(
+        self, rows: Int[np.ndarray, "m"], triangles: Int[np.ndarray, "m"]
+    ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
+        """Distances of points from a triangle each, and u and v of the closest points."""
+        distances, u, v = np.zeros((3, len(rows)))
+        for start in range(0, len(rows), _BLOCK):
+            at = slice(start, start + _BLOCK)
+            corner, ab, ac = (np.take(values, triangles[at], axis=1) for values in self._triangles)
+            squared, u[at], v[at] = triangle_distance(corner, ab, ac, np.take(self._points, rows[at], axis=1))
+            distances[at] = np.sqrt(squared)
+        return distances, u, v
+
+
+def _tree(points: Float[np.ndarray, "c 3"]) -> KDTree:
+    return KDTree(points, leafsize=16, balanced_tree=False)  # built faster, and searched as fast
+
+
+def _some(rows: Int[np.ndarray, "r"]) -> Int[np.ndarray, "s"]:
+    return rows[np.linspace(0, len(rows) - 1, min(len(rows), _SAMPLE)).astype(int)]
+
+
+def _in_parts(rows: Int[np.ndarray, "r"], pairs: float) -> list[Int[np.ndarray, "s"]]:
+    """Rows in parts of `_PAIRS_AT_ONCE`, where each has so many pairs."""
+    parts = min(int(np.ceil(len(rows) * pairs / _PAIRS_AT_ONCE)), len(rows))
+    return np.array_split(rows, max(parts, 1)) if len(rows) else []
+
+
+def _normals(triangles: _Triangles) -> Float[np.ndarray, "3 t"]:
+    """Unit normals; zero, which makes a ball of the disc, where a triangle is so thin that its normal is not exact."""
+    (x, y, z), (p, q, r) = triangles.ab, triangles.ac
+    normals = np.stack([y * r - z * q, z * p - x * r, x * q - y * p])
+    squared = _dot(normals, normals, 0)
+    sound = squared > _THIN * _dot(triangles.ab, triangles.ab, 0) * _dot(triangles.ac, triangles.ac, 0)
+    return normals * np.where(sound, 1 / np.sqrt(np.where(sound, squared, 1)), 0)
+
+
+def _groups(triangles: _Triangles) -> _Groups:
+    n_triangles = triangles.a.shape[1]
+    members = np.minimum(np.arange(-(-n_triangles // _GROUP) * _GROUP), n_triangles - 1).reshape(-1, _GROUP).T
+    of_members = _Triangles(*(np.take(rows, members, axis=1) for rows in triangles))
+    (a, ab, ac), (middles, radii) = of_members, _balls(of_members)
+    low = (a + np.minimum(np.minimum(ab, ac), 0)).min(axis=1)
+    high = (a + np.maximum(np.maximum(ab, ac), 0)).max(axis=1)
+    centres, squared = (low + high) / 2, np.zeros(members.shape[1])
+    to_a = a - centres[:, None]
+    for corner in (to_a, to_a + ab, to_a + ac):
+        squared = np.maximum(squared, _dot(corner, corner, 0).max(axis=0))
+    reach = np.sqrt(squared) * (1 + _SLACK)
+    balls = np.concatenate([middles, radii[None]]).swapaxes(0, 1)  # a member's four numbers one after another
+    balls[1:, :3][:, :, -1][members[1:, -1] == members[:-1, -1]] = np.inf  # the last row, repeated
+    largest = max(_LARGE * np.median(reach), _TINY)
+    large = reach > largest
+    if large.any():
+        owner, points, sizes = _parts(triangles, np.unique(members[:, large]), largest)
+        alone = np.full((_GROUP, 4, len(owner)), np.inf)
+        alone[:, 3], alone[0] = 0, np.vstack([points, sizes])
+        balls = np.concatenate([balls[..., ~large], alone], axis=2)
+        members = np.concatenate([members[:, ~large], np.tile(owner, (_GROUP, 1))], axis=1)
+        centres = np.concatenate([centres[:, ~large], points], axis=1)
+        reach = np.concatenate([reach[~large], sizes])
+    return _Groups(np.ascontiguousarray(centres.T), reach, balls.reshape(4 * _GROUP, -1), members)
+
+
+def _balls(triangles: _Triangles) -> tuple[Float[np.ndarray, "3 t s"], Float[np.ndarray, "t s"]]:
+    """Middles of the triangles, and how far the corners are from them."""
+    a, ab, ac = triangles
     middle = (ab + ac) / 3
-    radius = np.sqrt(np.max([_dot(rows, rows) for rows in (middle, middle - ab, middle - ac)], axis=0))
-    parts = np.clip(np.ceil(radius / max(_LARGE * np.median(radius), np.finfo(float).tiny)), 1, _MOST_PARTS).astype(int)
-    points, owner, sizes = [], [], []
-    for n in np.unique(parts):
-        which = np.flatnonzero(parts == n)
+    squared = _dot(middle, middle, 0)
+    for side in (ab, ac):
+        squared = np.maximum(squared, _dot(middle - side, middle - side, 0))
+    return a + middle, np.sqrt(squared) * (1 + _SLACK)
+
+
+def _parts(
+    triangles: _Triangles, which: Int[np.ndarray, "l"], largest: float
+) -> tuple[Int[np.ndarray, "c"], Float[np.ndarray, "3 c"], Float[np.ndarray, "c"]]:
+    """Equal parts of triangles, as many as make them no larger: whose they are, their middles and radii."""
+    a, ab, ac = (rows[:, which, None] for rows in triangles)
+    radii = _balls(_Triangles(a, ab, ac))[1][:, 0]
+    number = np.clip(np.ceil(radii / largest), 1, _MOST_PARTS).astype(int)
+    owner, points, sizes = [], [], []
+    for n in np.unique(number):
+        cut = number == n
         i, j = (index.ravel() for index in np.meshgrid(range(n), range(n), indexing="ij"))
         # Of a triangle cut in n a side: the parts that stand like it, then those upside down.
         u, v = (np.concatenate([(x + 1 / 3)[i + j < n], (x + 2 / 3)[i + j < n - 1]]) / n for x in (i, j))
-        points.append((a[which, None] + u[:, None] * ab[which, None] + v[:, None] * ac[which, None]).reshape(-1, 3))
-        owner.append(np.repeat(which, len(u)))
-        sizes.append(np.repeat(radius[which] / n, len(u)))
-    return _Centres(np.concatenate(points), np.concatenate(owner), np.concatenate(sizes))
+        points.append((a[:, cut] + u * ab[:, cut] + v * ac[:, cut]).reshape(3, -1))
+        owner.append(np.repeat(which[cut], len(u)))
+        sizes.append(np.repeat(radii[cut] / n, len(u)))
+    return np.concatenate(owner), np.concatenate(points, axis=1), np.concatenate(sizes)
 
 
 def triangle_distance(
@@ -204,5 +368,6 @@ def polish(corners: AnyArray, points: AnyArray, uv: AnyArray, xp: Any = np) -> A
     return uv
 
 
-def _dot(a: AnyArray, b: AnyArray) -> AnyArray:
-    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+def _dot(a: AnyArray, b: AnyArray, axis: int = 1) -> AnyArray:
+    a, b = ((x[0], x[1], x[2]) if axis == 0 else (x[:, 0], x[:, 1], x[:, 2]) for x in (a, b))
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

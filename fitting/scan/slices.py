@@ -2,8 +2,9 @@
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
 from .closest_points import nearest_rows
@@ -13,22 +14,23 @@ from .scan import Scan
 class Strokes(NamedTuple):
     """The contours of a scan in slices, which a person drew with a few strokes: neighbours share their errors."""
 
-    nearest: Int[np.ndarray, "p"]
+    nearest: Int[Array | np.ndarray, "p"]
     """The row of the nearest point of the same slice."""
-    most: float
+    most: Float[Array | np.ndarray, ""]
     """Points of a contour in a row, as many as make up the distance between slices."""
 
-    def points_a_measurement(self, distances: Float[np.ndarray, "p"], weights: Float[np.ndarray, "p"]) -> float:
+    def count_points_a_measurement(self, distances: Float[Array, "p"], weights: Float[Array, "p"]) -> Float[Array, ""]:
         """How many points of a contour tell as much as one measurement; 1 where their distances are independent.
 
         With the correlation r of the distances of neighbours, (1 + r) / (1 - r) points count as one: so it is with the
         variance of a mean (first-order autoregression). Where the surface is off they are correlated too: no more count
         as one than make up the distance between slices, so that the scan tells as much along as across.
         """
-        both = np.sqrt(weights * weights[self.nearest])
-        own, shared = np.sum(both * distances**2), np.sum(both * distances * distances[self.nearest])
-        r = float(np.clip(shared / max(own, np.finfo(float).tiny), 0, 1))
-        return self.most if r == 1 else min((1 + r) / (1 - r), self.most)
+        both = jnp.sqrt(weights * weights[self.nearest])
+        own, shared = jnp.sum(both * distances**2), jnp.sum(both * distances * distances[self.nearest])
+        r = jnp.clip(shared / jnp.maximum(own, jnp.finfo(own.dtype).tiny), 0, 1)
+        most = jnp.asarray(self.most, r.dtype)
+        return jnp.where(r < 1, jnp.minimum((1 + r) / jnp.where(r < 1, 1 - r, 1.0), most), most)
 
 
 def contour_spacing(
@@ -52,4 +54,5 @@ def find_strokes(scan: Scan) -> Strokes | None:
         return None
     nearest, along, across = contour_spacing(np.asarray(scan.points, np.float64), np.asarray(scan.slices))
     spacing = float(np.median(along))
-    return Strokes(nearest, max(float(np.median(across)) / spacing, 1.0) if spacing > 0 else 1.0)
+    most = max(float(np.median(across)) / spacing, 1.0) if spacing > 0 else 1.0
+    return Strokes(nearest, np.asarray(most))

@@ -1,12 +1,17 @@
-"""A linear solver for optimistix: least squares without a matrix, one product a step."""
+"""Steps without a matrix, wherever JAX computes: least squares by conjugate gradients, one product a step."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import lineax as lx
 from jax import lax
 from jaxtyping import Array, Bool, Float
+
+from ..model.residual import Held, Model, Residual
+from ..model.unknowns import Variables
 
 
 class ConjugateGradients(lx.AbstractLinearSolver):
@@ -47,6 +52,32 @@ class ConjugateGradients(lx.AbstractLinearSolver):
         k, x, *_ = lax.while_loop(goes_on, step, (jnp.int32(0), x, vector, x, zero, zero))
         return x, lx.RESULTS.successful, {"num_steps": k}
 
+    def linearise(self, model: Model, y: Variables, held: Held) -> "OperatorEquations":
+        """The rows of a fit about a place, for steps and solutions by conjugate gradients."""
+        return OperatorEquations(self, model, y, held)
+
+    def solve_normal(self, multiply: Callable, sides: Float[Array, "n s"]) -> Float[Array, "n s"]:
+        """Solutions with a symmetric positive matrix that is given by its products, one for each side."""
+
+        def solve(side: Float[Array, "n"]) -> Float[Array, "n"]:
+            zero = jnp.zeros_like(side)
+
+            def goes_on(carry: tuple) -> Bool[Array, ""]:
+                k, _, _, _, gamma = carry
+                return (k < self.max_steps) & (gamma > self.rtol**2 * jnp.sum(side**2))
+
+            def step(carry: tuple) -> tuple:
+                k, x, left, direction, gamma = carry
+                along = multiply(direction)
+                alpha = _over(gamma, jnp.sum(direction * along))
+                x, left = x + alpha * direction, left - alpha * along
+                new = jnp.sum(left**2)
+                return k + 1, x, left, left + _over(new, gamma) * direction, new
+
+            return lax.while_loop(goes_on, step, (jnp.int32(0), zero, side, side, jnp.sum(side**2)))[1]
+
+        return jax.vmap(solve, 1, 1)(sides)
+
     def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         return state.T, options
 
@@ -55,6 +86,91 @@ class ConjugateGradients(lx.AbstractLinearSolver):
 
     def assume_full_rank(self) -> bool:
         return True
+
+
+class OperatorEquations:
+    """Linearised rows about one place, as products with their derivatives; the same as `SparseEquations` on the host."""
+
+    def __init__(self, solver: ConjugateGradients, model: Model, y: Variables, held: Held):
+        self._solver, self.model, self._held = solver, model, held
+        residual, layout = Residual(model), model.layout
+        zero = jnp.zeros(layout.n, y.control.vertices.dtype)
+
+        def rows(vector: Float[Array, "n"]) -> dict[str, Float[Array, "_"]]:
+            return residual.rows(model.retract(y, layout.split(vector)), held)
+
+        self.values, self._derivative = jax.linearize(rows, zero)
+        """Rows before they are weighed, by name."""
+        self._zero = zero
+        self._transposed = jax.linear_transpose(self._derivative, zero)
+        given = {"distance": held.distance_precisions} | held.precisions
+        self._precisions = {
+            name: jnp.broadcast_to(jnp.asarray(given[name], zero.dtype), row.shape) for name, row in self.values.items()
+        }
+
+    def step(self, damping: Float[Array, "n"], active: Bool[Array, "k"]) -> Float[Array, "n"]:
+        """The most probable offset, to first order."""
+        free = self._free(active)
+        roots = {name: jnp.sqrt(precision) for name, precision in self._precisions.items()}
+
+        def weighed(vector: Float[Array, "n"]) -> Float[Array, "m"]:
+            rows = self._derivative(free * vector)
+            return jnp.concatenate([*(roots[name] * rows[name] for name in rows), self._damped(damping, free * vector)])
+
+        right = [-roots[name] * row for name, row in self.values.items()]
+        sides = jnp.concatenate([*right, jnp.zeros_like(self._damped(damping, self._zero))])
+        operator = lx.FunctionLinearOperator(weighed, jax.eval_shape(lambda: self._zero))
+        return free * lx.linear_solve(operator, sides, self._solver, throw=False).value
+
+    def solver(self, which: str, damping: Float[Array, "n"], active: Bool[Array, "k"]) -> Callable:
+        """Solves with the damped normal matrix of "all" rows, or of those of the "prior"s alone."""
+        free = self._free(active)
+        names = [name for name in self.values if which == "all" or name != "distance"]
+
+        def damp(vector: Float[Array, "n"]) -> Float[Array, "m"]:
+            return self._damped(damping, vector)
+
+        back = jax.linear_transpose(damp, self._zero)
+
+        def multiply(vector: Float[Array, "n"]) -> Float[Array, "n"]:
+            vector = free * vector
+            return free * (self._normal(names, vector) + back(damp(vector))[0]) + (1 - free) * vector
+
+        return lambda sides: free[:, None] * self._solver.solve_normal(multiply, free[:, None] * sides)
+
+    def multiply_data(self, x: Float[Array, "n s"]) -> Float[Array, "n s"]:
+        """The normal matrix of the distances times vectors."""
+        free = jnp.asarray(self.model.is_free, x.dtype)
+        return jax.vmap(lambda column: free * self._normal(["distance"], free * column), 1, 1)(x)
+
+    def times(self, name: str, x: Float[Array, "n s"]) -> Float[Array, "m s"]:
+        """The derivatives of a prior's rows times vectors."""
+        return jax.vmap(lambda column: self._derivative(column)[name], 1, 1)(x)
+
+    def transposed(self, name: str, x: Float[Array, "m s"]) -> Float[Array, "n s"]:
+        """Their transposed derivatives times values a row."""
+        return jax.vmap(lambda column: self._back({name: column}), 1, 1)(x)
+
+    def _normal(self, names: list[str], vector: Float[Array, "n"]) -> Float[Array, "n"]:
+        rows = self._derivative(vector)
+        return self._back({name: self._precisions[name] * rows[name] for name in names})
+
+    def _back(self, rows: dict[str, Float[Array, "_"]]) -> Float[Array, "n"]:
+        return self._transposed({name: rows.get(name, jnp.zeros_like(row)) for name, row in self.values.items()})[0]
+
+    def _free(self, active: Bool[Array, "k"]) -> Float[Array, "n"]:
+        free = jnp.asarray(self.model.is_free, self._zero.dtype)
+        own = jnp.ones(self.model.layout.n_own, bool)
+        return jnp.where(jnp.concatenate([own, active]), free, 0.0)
+
+    def _damped(self, damping: Float[Array, "n"], vector: Float[Array, "n"]) -> Float[Array, "n"]:
+        """How far the unknowns move, over what damps them; vertices about their common motion, where that is free."""
+        layout = self.model.layout
+        if "motion" in dict(layout.shared) and layout.has_vertices:
+            table = vector[: layout.n_own].reshape(layout.n_vertices, layout.width)
+            motion = jnp.pad(vector[layout.columns("motion")], (0, layout.width - 3))
+            vector = jnp.concatenate([(table - motion[None]).reshape(-1), vector[layout.n_own :]])
+        return jnp.sqrt(damping) * vector
 
 
 def _over(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:

@@ -6,20 +6,21 @@ have no face in common (Curtis, Powell and Reid, On the estimation of sparse Jac
 equations are sums of small dense matrices, one a face. Which vertices belong to which face is analysed once.
 """
 
+import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Array, Float, Int, Shaped
+from jaxtyping import Array, Float, Int
 
 import jaxsubdiv as js
 
-from ..model.residual import Pairs, Rows, Start, signed_distances, surface_and_priors
-from ..model.unknowns import Free, Unknowns, no_offset
+from ..model.residual import Model, Pairs, signed_distances
+from ..model.unknowns import Layout, Unknowns, Variables
 
 _ROWS_A_BLOCK = 24
 _PAIRS_AT_ONCE = 65_536  # bounds the memory to a few hundred MB, however large the scan is
@@ -47,8 +48,8 @@ class Elements(NamedTuple):
     """Unknowns of every face; `n` where there are fewer than in other faces."""
     seeds_of: Int[np.ndarray, "f d"]
     """The seed that each of them moves in."""
-    seeds: Unknowns
-    """Directions, one a leading row: many unknowns at once, no two of them in one face. The last is at random."""
+    seeds: Float[np.ndarray, "s n"]
+    """Directions: many unknowns at once, no two of them in one face. The last is at random."""
     pattern: sp.csc_array
     """Of the normal equations, which are symmetric; its values are the place of each entry in the lower triangle."""
     runs: list[Run]
@@ -71,8 +72,8 @@ class Derivatives(NamedTuple):
     """Values at the start of a sweep, and their derivatives by the unknowns of the control faces that they lie in."""
 
     surface: Float[Array, "v 3"]
-    rows: Rows
-    """Of the priors."""
+    rows: Float[Array, "m"]
+    """Of the face priors, one after the other."""
     by_rows: Float[Array, "m d"]
     by_surface: Float[Array, "f w d 3"]
     """Of the vertices of the patches."""
@@ -94,16 +95,15 @@ def find_patches(surface: js.RefinedSurface, owner: Int[np.ndarray, "g"], n_cont
     return Patches(owner, vertices, slot[place].reshape(corners.shape).astype(np.int32))
 
 
-def find_elements(topology: js.Topology, free: Free, start: Start, rings: int) -> Elements:
+def find_elements(model: Model, rings: int) -> Elements:
     """Analyse which unknowns belong together, if a face depends on the vertices of `rings` rings of faces around it."""
-    n_vertices = topology.n_control_vertices
-    near = _vertices_near_faces(topology, rings)
-    colour = _colour(near)
-    zero = no_offset(free, start.scheme, start.control)
-    per_vertex = sum(part.shape[1] for part in (zero.vertices, zero.normals) if part is not None)
-    n_h = 0 if zero.h is None else zero.h.size
-    n = n_vertices * per_vertex + n_h
-    n_colours = int(colour.max()) + 1
+    layout = model.layout
+    near = _vertices_near_faces(model.topology, rings)
+    colours = colour(near)
+    per_vertex, n_own = layout.width, layout.n_own
+    last = np.arange(n_own, n_own + n_lengths(layout))
+    n = n_own + len(last)
+    n_colours = int(colours.max()) + 1
 
     counts, n_faces = np.diff(near.indptr), len(near.indptr) - 1
     slot = np.arange(near.indptr[-1]) - np.repeat(near.indptr[:-1], counts)
@@ -112,63 +112,59 @@ def find_elements(topology: js.Topology, free: Free, start: Start, rings: int) -
     there = vertices >= 0
     components = np.arange(per_vertex)
     columns = np.where(there[..., None], vertices[..., None] * per_vertex + components, n)
-    seeds_of = np.where(there[..., None], colour[vertices][..., None] * per_vertex + components, 0)
-    last = np.arange(n_h)
+    seeds_of = np.where(there[..., None], colours[vertices][..., None] * per_vertex + components, 0)
+    first = n_colours * per_vertex
     columns, seeds_of = (
         np.concatenate([table.reshape(len(vertices), -1), np.tile(tail, (len(vertices), 1))], axis=1)
-        for table, tail in ((columns, n_vertices * per_vertex + last), (seeds_of, n_colours * per_vertex + last))
+        for table, tail in ((columns, last), (seeds_of, first + last - n_own))
     )
-    seeds = np.zeros((n_colours * per_vertex + n_h + 1, n))
-    rows = np.arange(n_vertices * per_vertex)
-    seeds[colour[rows // per_vertex] * per_vertex + rows % per_vertex, rows] = 1
-    seeds[n_colours * per_vertex + last, n_vertices * per_vertex + last] = 1
-    seeds[-1] = np.random.default_rng(0).normal(size=n)
+    seeds = np.zeros((first + len(last) + 1, layout.n))
+    rows = np.arange(n_own)
+    seeds[colours[rows // max(per_vertex, 1)] * per_vertex + rows % max(per_vertex, 1), rows] = 1
+    seeds[first + last - n_own, last] = 1
+    seeds[-1, :n] = np.random.default_rng(0).normal(size=n)
     pattern, runs = _pattern(columns, n)
-    directions = jax.vmap(lambda row: to_unknowns(row, zero))(jnp.asarray(seeds))
-    return Elements(columns, seeds_of, directions, pattern, runs, n)
+    return Elements(columns, seeds_of, seeds, pattern, runs, n)
 
 
-def to_unknowns(row: Float[Array, "n"], like: Unknowns) -> Unknowns:
-    """A vector of all unknowns, vertex by vertex and then h, as offsets."""
-    parts = [part for part in (like.vertices, like.normals) if part is not None]
-    n_vertices = parts[0].shape[0] if parts else 0
-    width = sum(part.shape[1] for part in parts)
-    table = row[: n_vertices * width].reshape(n_vertices, width)
-    n_first = 0 if like.vertices is None else 3
-    h = None if like.h is None else row[n_vertices * width :].reshape(like.h.shape).astype(like.h.dtype)
-    dtype = parts[0].dtype if parts else None
-    return Unknowns(
-        None if like.vertices is None else table[:, :n_first].astype(dtype),
-        None if like.normals is None else table[:, n_first:].astype(dtype),
-        h,
-    )
+def n_lengths(layout: Layout) -> int:
+    """Number of tangent lengths h among the unknowns: the only shared ones that the surface depends on."""
+    return next((math.prod(of.shape) for name, of in layout.shared if name == "h"), 0)
+
+
+def surface_and_rows(model: Model, y: Variables, offset: Unknowns, held: dict[str, Any]) -> tuple[Array, Array]:
+    """The surface's vertices, and the rows of the face priors one after the other, at an offset."""
+    moved = model.retract(y, offset)
+    surface = model.refine(moved)
+    place = model.place(moved, surface)
+    none = jnp.zeros(0, surface.vertices.dtype)
+    return surface.vertices, jnp.concatenate([none] + [one.rows(place, held[one.name]) for one in model.face_priors])
 
 
 @eqx.filter_jit
 def differentiate(
-    zero: Unknowns,
-    start: Start,
-    seeds: Unknowns,
+    model: Model,
+    y: Variables,
+    held: dict[str, Any],
+    seeds: Float[Array | np.ndarray, "s n"],
     seeds_of: Int[Array | np.ndarray, "f d"],
     row_faces: Int[Array | np.ndarray, "m"],
     patches: Int[Array | np.ndarray, "f w"],
 ) -> Derivatives:
-    """The surface and the rows of the priors at the start of a sweep, and their derivatives.
+    """The surface and the rows of the face priors at the start of a sweep, and their derivatives.
 
     Args:
+        held: what each prior holds.
         seeds: see `Elements`; so is `seeds_of`.
         row_faces: the control face of every row.
         patches: the vertices of the surface over every control face.
     """
-    (surface, rows), derivative = jax.linearize(lambda offset: surface_and_priors(offset, start), zero)
-
-    def along(seed: Unknowns) -> tuple[Array, Array]:
-        by_surface, by_rows = derivative(seed)
-        return by_surface, jnp.concatenate(by_rows)
-
-    of_surface, of_rows = jax.lax.map(along, seeds)
-    by_rows = jnp.take_along_axis(of_rows.T, seeds_of[row_faces], axis=1)
-    by_surface = of_surface[seeds_of[:, None, :], patches[:, :, None]]
+    dtype, split = y.control.vertices.dtype, model.layout.split
+    zero = split(jnp.zeros(model.layout.n, dtype))
+    (surface, rows), derivative = jax.linearize(lambda offset: surface_and_rows(model, y, offset, held), zero)
+    of_surface, of_rows = jax.lax.map(lambda seed: derivative(split(seed)), jnp.asarray(seeds, dtype))
+    by_rows = jnp.take_along_axis(of_rows.T, jnp.asarray(seeds_of)[row_faces], axis=1)
+    by_surface = of_surface[jnp.asarray(seeds_of)[:, None, :], jnp.asarray(patches)[:, :, None]]
     return Derivatives(surface, rows, by_rows, by_surface, (of_surface[-1], of_rows[-1]))
 
 
@@ -189,20 +185,14 @@ def differentiate_distances(
 
 def forgets_some(elements: Elements, patches: Patches, found: Derivatives, row_faces: Int[np.ndarray, "m"]) -> bool:
     """Whether values depend on unknowns that the elements do not know: seen in the derivative along the last seed."""
-    seed = np.append(flat(jax.tree.map(lambda rows: rows[-1], elements.seeds)), 0.0)[elements.columns]
+    seed = np.append(elements.seeds[-1, : elements.n], 0.0)[elements.columns]
     of_surface, of_rows = (np.asarray(part) for part in found.along)
     by_surface = np.einsum("fwdx,fd->fwx", np.asarray(found.by_surface), seed)
     corners = patches.owner[:, None], patches.slots
     surface = by_surface[corners] - of_surface[patches.vertices[corners]]
     rows = np.einsum("md,md->m", np.asarray(found.by_rows), seed[row_faces]) - of_rows
-    return any(np.abs(off).max() > _WRONG * np.abs(of).max() for off, of in ((surface, of_surface), (rows, of_rows)))
-
-
-def flat(unknowns: Unknowns) -> Shaped[np.ndarray, "n"]:
-    """All unknowns as one vector, vertex by vertex and then h."""
-    parts = [np.asarray(part) for part in (unknowns.vertices, unknowns.normals) if part is not None]
-    h = np.zeros(0) if unknowns.h is None else np.ravel(np.asarray(unknowns.h))
-    return np.concatenate([np.concatenate(parts, axis=1).ravel() if parts else np.zeros(0), h])
+    both = ((surface, of_surface), (rows, of_rows))
+    return any(np.abs(off).max(initial=0) > _WRONG * np.abs(of).max(initial=0) for off, of in both)
 
 
 def normal_matrix(
@@ -328,7 +318,7 @@ def _vertices_near_faces(topology: js.Topology, rings: int) -> sp.csr_array:
     return near
 
 
-def _colour(near: sp.csr_array) -> Int[np.ndarray, "v"]:
+def colour(near: sp.csr_array) -> Int[np.ndarray, "v"]:
     """A colour for every vertex, so that no two in one face have the same: greedily, the crowded ones first."""
     together = (near.T @ near).tocsr()
     colour = np.full(len(together.indptr) - 1, -1)

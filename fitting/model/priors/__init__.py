@@ -1,0 +1,92 @@
+"""What is known of a surface before it is measured: the settings, and the register of priors."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsubdiv import strong_float
+
+from .base import AbstractFacePrior, AbstractPrior, AbstractVertexPrior, Place, Start
+from .bend import Bend
+from .boundary import BoundaryPrior
+from .height import Height
+from .landmarks import LandmarkPrior
+from .margin import Margin
+from .shape_modes import ShapeModes, ShapePrior
+from .shifts import ShiftPrior
+from .stretch import Stretch
+from .symmetry import SymmetryPrior
+from .tangent_length import TangentLength
+
+REGISTER: tuple[type[AbstractPrior], ...] = (
+    Bend,
+    Height,
+    Stretch,
+    Margin,
+    LandmarkPrior,
+    BoundaryPrior,
+    TangentLength,
+    ShiftPrior,
+    SymmetryPrior,
+    ShapePrior,
+)
+"""Every prior, in the order of its rows; a new one is one line here, and a field of `Priors` for its settings."""
+
+__all__ = ["REGISTER", "AbstractFacePrior", "AbstractPrior", "AbstractVertexPrior", "Place", "Priors", "Start"]
+
+
+def _positive(value: object) -> Float[Array, ""]:
+    value = strong_float(value)
+    if not bool(value > 0):
+        raise ValueError(f"a standard deviation must be positive; got {value}. Give jnp.inf to leave a prior out.")
+    return value
+
+
+def _if_given(converter: Callable[[object], Float[Array, ""]]) -> Callable[[object], Float[Array, ""] | None]:
+    return lambda value: None if value is None else converter(value)
+
+
+class Priors(eqx.Module):
+    """What is known of a surface before it is measured, each as the standard deviation that is expected.
+
+    A prior of the standard deviation `jnp.inf` is left out.
+
+    Attributes:
+        bend: of the bend asymmetry of an edge in mm (see `bend_asymmetry`): small is smooth. None, the default: found
+            from the scan, place by place, as that which makes the scan most probable (see `_evidence`).
+        stretch: of the change of a control edge along the surface, against the control mesh where the fit starts, as a
+            part of the edge's length. It keeps the control vertices in their places where the scan does not.
+        h: of the tangent length coefficient about 1.
+        symmetry: of the departure of a control vertex from the mirror image of its partner in mm, in each coordinate;
+            of control normals, by as much as they move the surface. Default: left out. The mirror plane moves along
+            with the mesh; `fit` finds the partners, or is given them (see `find_symmetry`).
+        likeness: how much of the control mesh's own bend asymmetry, where the fit starts, is expected of the surface,
+            from 0 to 1; `bend` is then of the departure from that. No standard deviation, unlike the others. Unless it
+            is 0, the control mesh's curvature is expected too (see `bend_height`), as closely as the scan shows place
+            by place: holes of the scan are filled as the control mesh is shaped. None, the default: the likeness that
+            makes the scan most probable, about 0.9 where the control mesh is the same anatomy of another person and
+            about 0 where its details say nothing of the scan's; and 0 where `bend` is given. Give 0 where the control
+            mesh was made from this very scan or fitted to it before, for its noise would be expected again. With `bend`
+            given, nothing is expected of curvature.
+        shape: the family that the control mesh is one of, as `shape_modes` found it over control meshes that correspond
+            to this one (`Modes`), or a `ShapeModes`: where the scan lacks something, it is filled by scores along the
+            modes that the rest of the scan shows. Default: left out.
+        shift: of how far breathing displaced a slice of the scan, in mm, along each of two axes of the slice's plane.
+
+    Raises:
+        ValueError: a standard deviation is not positive, or the likeness not from 0 to 1.
+    """
+
+    bend: Float[Array, ""] | None = eqx.field(converter=_if_given(_positive), default=None)
+    stretch: Float[Array, ""] = eqx.field(converter=_positive, default=0.2)
+    h: Float[Array, ""] = eqx.field(converter=_positive, default=0.05)
+    symmetry: Float[Array, ""] = eqx.field(converter=_positive, default=np.inf)
+    shift: Float[Array, ""] = eqx.field(converter=_positive, default=3.0)
+    likeness: Float[Array, ""] | None = eqx.field(converter=_if_given(strong_float), default=None)
+    shape: ShapeModes | None = eqx.field(converter=ShapeModes.of, default=None)
+
+    def __check_init__(self):
+        if self.likeness is not None and not bool((self.likeness >= 0) & (self.likeness <= 1)):
+            raise ValueError(f"the likeness is a share, from 0 to 1; got {self.likeness}.")

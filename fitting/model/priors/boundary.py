@@ -1,21 +1,23 @@
 """Boundary curves: where an open surface ends, as its boundary follows from points of the curve."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
-from scipy.spatial import KDTree
 
 import jaxsubdiv as js
 from jaxsubdiv.errors import name_rows
 from jaxsubdiv.half_edges import half_edges
-from jaxsubdiv.linalg import dot, take
+from jaxsubdiv.linalg import cross, dot, norm, take, unit
 
-from ...scan.closest_points import nearest_on_segments
+from ...scan.closest_points import triangle_distance
 from ...scan.scan import ScanError
+from .base import AbstractFacePrior, Place, Start
 
+_AT_ONCE = 256  # points that are held against all boundary edges together
 _ON_CURVE = 1e-9  # in lengths of the boundary edge: a point that is nearer is on it, in no direction from it
 
 
@@ -26,27 +28,6 @@ class BoundaryCurve(NamedTuple):
     """In mm, as many as there are, in any order; of the whole boundary of the surface or of a part of it."""
     deviation: float = 0.5
     """How far the boundary may be off each of them, as a standard deviation in mm."""
-
-
-class Rim(NamedTuple):
-    """Points of the curve, paired with the boundary of the surface as one sweep holds them."""
-
-    points: Float[Array, "b 3"]
-    face: Int[np.ndarray, "b"]
-    """Of the surface."""
-    ends: Int[Array, "b 2"]
-    """Vertices of the boundary edge that each is paired with."""
-    along: Float[Array, "b"]
-    """Where on it, 0 to 1."""
-    directions: Float[Array, "b 2 3"]
-    """Two unit vectors across the boundary, which slides freely along itself."""
-    deviation: Float[Array, ""]
-
-    def rows(self, vertices: Float[Array, "w 3"]) -> Float[Array, "r"]:
-        """Distances across the boundary over their standard deviation, two a point."""
-        a, b = (take(vertices, end) for end in self.ends.T)
-        away = a + self.along[:, None] * (b - a) - self.points
-        return jnp.stack([dot(self.directions[:, i], away)[:, 0] for i in (0, 1)], axis=1).reshape(-1) / self.deviation
 
 
 class _Sides(NamedTuple):
@@ -90,42 +71,99 @@ def checked_curve(curve: BoundaryCurve, topology: js.Topology) -> BoundaryCurve:
     return BoundaryCurve(points, deviation)
 
 
-def pair_with_boundary(curve: BoundaryCurve, surface: js.RefinedSurface) -> Rim:
+class Rim(NamedTuple):
+    """Points of the curve, paired with the boundary of the surface as one sweep holds them."""
+
+    side: Int[Array, "b"]
+    """The boundary edge that each is paired with."""
+    along: Float[Array, "b"]
+    """Where on it, 0 to 1."""
+    directions: Float[Array, "b 2 3"]
+    """Two unit vectors across the boundary, which slides freely along itself."""
+    covered: Bool[Array, "w"]
+    """Which vertices of the boundary the curve speaks of: those within a control edge of a place paired with it."""
+
+
+class BoundaryPrior(AbstractFacePrior):
+    """The boundary of the surface passes through the points of a curve.
+
+    Attributes:
+        points: of the curve, in mm.
+        counts: 1 each; 0 of points that only fill up the array.
+        deviation: standard deviation in mm.
+        ends: vertices of the boundary edges.
+        of_sides: the control face of each.
+        vertices: those on the boundary.
+    """
+
+    name: ClassVar[str] = "rim"
+    points: Float[Array, "b 3"]
+    counts: Float[Array, "b"]
+    deviation: Float[Array, ""]
+    ends: Int[Array | np.ndarray, "s 2"]
+    of_sides: Int[np.ndarray, "s"]
+    vertices: Int[Array | np.ndarray, "r"]
+
+    @classmethod
+    def make(cls, priors: Any, start: Start) -> "BoundaryPrior | None":
+        curve = start.inputs.get("boundary")
+        if curve is None:
+            return None
+        first, last, face = _boundary_sides(start.topology.faces)
+        points = jnp.asarray(curve.points, start.control.vertices.dtype)
+        ends = np.stack([first, last], axis=1)
+        deviation = jnp.asarray(curve.deviation, points.dtype)
+        counts = jnp.asarray(start.inputs.get("boundary_counts", np.ones(len(points))), points.dtype)
+        return cls(points, counts, deviation, ends, start.owner[face], np.unique(ends))
+
+    def hold(self, place: Place, strengths: dict[str, Array]) -> Rim:
+        assert place.surface is not None
+        return pair_with_boundary(self, place.surface, place.edge)
+
+    def rows(self, place: Place, held: Rim) -> Float[Array, "m"]:
+        """Distances across the boundary over their standard deviation, two a point."""
+        assert place.surface is not None
+        a, b = (take(place.surface.vertices, jnp.asarray(self.ends)[held.side, i]) for i in (0, 1))
+        away = a + held.along[:, None] * (b - a) - self.points
+        across = [dot(held.directions[:, i], away)[:, 0] for i in (0, 1)]
+        return jnp.stack(across, axis=1).reshape(-1) / self.deviation
+
+    def precisions(self, strengths: dict[str, Array]) -> Any:
+        return self.counts.repeat(2)
+
+    def faces(self, held: Rim) -> Int[np.ndarray, "m"]:
+        return np.repeat(self.of_sides[np.asarray(held.side)], 2)
+
+
+def pair_with_boundary(prior: BoundaryPrior, surface: js.RefinedSurface, edge: Float[Array, ""]) -> Rim:
     """Every point of the curve with the exactly closest point of the surface's boundary edges."""
-    vertices = np.asarray(surface.vertices, np.float64)
-    start, end, face = _boundary_sides(surface.faces)
-    side, along = nearest_on_segments(vertices[start], vertices[end], curve.points)
-    a, b = vertices[start[side]], vertices[end[side]]
-    edge = b - a
-    away = curve.points - (a + along[:, None] * edge)
+    vertices, ends, points = surface.vertices, jnp.asarray(prior.ends), prior.points
+    start, along_sides = vertices[ends[:, 0]], vertices[ends[:, 1]] - vertices[ends[:, 0]]
+
+    def nearest(point: Float[Array, "3"]) -> tuple[Int[Array, ""], Float[Array, ""]]:
+        # A triangle without area is its edges.
+        squared, u, v = triangle_distance(start.T, along_sides.T, along_sides.T, point[:, None], jnp)
+        side = jnp.argmin(squared)
+        return side, (u + v)[side]
+
+    side, along = lax.map(nearest, points, batch_size=_AT_ONCE)
+    a, sides = start[side], along_sides[side]
+    places = a + along[:, None] * sides
+    away = points - places
     # The first direction is that of the distance: at a corner of the boundary it is not at right angles to the edge,
     # and the boundary slides along what of the edge is.
-    tangent = _unit(edge)
-    normals = np.asarray(surface.normals, np.float64)[start[side]]
-    near = np.linalg.norm(away, axis=1) <= _ON_CURVE * np.linalg.norm(edge, axis=1)
-    first = _unit(np.where(near[:, None], normals - np.sum(normals * tangent, axis=1, keepdims=True) * tangent, away))
-    second = _unit(np.cross(tangent, first))
-    dtype = surface.vertices.dtype
-    return Rim(
-        jnp.asarray(curve.points, dtype),
-        face[side],
-        jnp.asarray(np.stack([start[side], end[side]], axis=1), jnp.int32),
-        jnp.asarray(along, dtype),
-        jnp.asarray(np.stack([first, second], axis=1), dtype),
-        jnp.asarray(curve.deviation, dtype),
-    )
+    tangent, normals = unit(sides), surface.normals[ends[side, 0]]
+    near = norm(away) <= _ON_CURVE * norm(sides)
+    first = unit(jnp.where(near, normals - dot(normals, tangent) * tangent, away))
+    second = unit(cross(tangent, first))
+    counted = jnp.where(prior.counts[:, None] > 0, places, jnp.inf)
 
+    def is_near(vertex: Float[Array, "3"]) -> Bool[Array, ""]:
+        return jnp.min(jnp.sum((counted - vertex[None]) ** 2, axis=1)) <= edge**2
 
-def held_vertices(curve: BoundaryCurve, surface: js.RefinedSurface, edge: float) -> Bool[np.ndarray, "w"]:
-    """Which vertices of the boundary the curve speaks of: those within a control edge of a place paired with it."""
-    vertices = np.asarray(surface.vertices, np.float64)
-    start, end, _ = _boundary_sides(surface.faces)
-    side, along = nearest_on_segments(vertices[start], vertices[end], curve.points)
-    places = vertices[start[side]] + along[:, None] * (vertices[end[side]] - vertices[start[side]])
-    rows = np.unique(np.concatenate([start, end]))
-    held = np.zeros(len(vertices), bool)
-    held[rows] = KDTree(places).query(vertices[rows])[0] <= edge
-    return held
+    covered = lax.map(is_near, vertices[prior.vertices], batch_size=_AT_ONCE)
+    mask = jnp.zeros(len(vertices), bool).at[prior.vertices].set(covered)
+    return Rim(side.astype(jnp.int32), along, jnp.stack([first, second], axis=1), mask)
 
 
 def _boundary_sides(faces: Mapping[int, Any]) -> _Sides:
@@ -133,7 +171,3 @@ def _boundary_sides(faces: Mapping[int, Any]) -> _Sides:
     sides = half_edges({size: np.asarray(rows) for size, rows in faces.items()})
     alone = np.bincount(sides.edge, minlength=len(sides.edges))[sides.edge] == 1
     return _Sides(sides.start[alone], sides.end[alone], sides.face[alone])
-
-
-def _unit(rows: Float[np.ndarray, "b 3"]) -> Float[np.ndarray, "b 3"]:
-    return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), np.finfo(float).tiny)

@@ -1,14 +1,11 @@
-"""Mirror images: which control vertices are, and the prior that keeps a fit symmetric about a plane that it finds.
+"""Mirror images: which control vertices are, and the prior that keeps a fit symmetric about a plane that it finds."""
 
-The rows of the prior tie vertices on opposite sides of the mesh, so that they lie in no control face; but they are
-linear in the vertices, and their derivatives need no program. The plane moves along: a step solves for it too.
-"""
+from collections.abc import Iterator
+from typing import Any, ClassVar, NamedTuple
 
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
-
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
-import scipy.sparse as sp
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
@@ -19,13 +16,12 @@ from jaxsubdiv.half_edges import half_edges
 from jaxsubdiv.linalg import unit
 
 from ...scan.closest_points import AnyArray
-from ..unknowns import Unknowns, tangents
+from ..unknowns import Shared, tangents
+from .base import AbstractVertexPrior, Place, Start
 
 _ROUNDS = 3  # of pairing and taking the plane from the pairs: the first plane is from one pair
 _PROBES, _PLAUSIBLE = 32, 0.2  # vertices that a plane is tried on, and how near, in edges, half of them must come
 _LEVER = 1 / 8  # of an edge: by eq. (2) an edge point moves by so much for a normal that turns by one radian
-
-Solve = Callable[[Float[np.ndarray, "n k"]], Float[np.ndarray, "n k"]]
 
 
 class Plane(NamedTuple):
@@ -120,136 +116,92 @@ def symmetry_of(partner: ArrayLike, vertices: Float[np.ndarray, "v 3"]) -> Symme
     return Symmetry(partner, _plane_of(partner, np.asarray(vertices, np.float64)))
 
 
-class Mirror(NamedTuple):
-    """The prior about one place: what a sweep holds of it, and the refit."""
+class _Held(NamedTuple):
+    """What a sweep holds of the prior."""
 
+    plane: Plane
+    turns: Float[Array, "2 3"]
+    """Directions that the normal of the plane may turn to."""
+    extent: Float[Array, ""]
+    """Size of the mesh in mm: a turn of 1 / extent moves its outer parts by 1 mm."""
+    lever: Float[Array, ""]
+    """By how much the surface moves, in mm, for a normal that turns by one radian."""
+
+
+class SymmetryPrior(AbstractVertexPrior):
+    """Control vertices are the mirror images of their partners, and control normals are, as far as they move the
+    surface.
+
+    The plane moves along: a step solves for it too, for a plane that is found from the vertices alone would follow
+    them, and they it, little by little.
+
+    Attributes:
+        left, right: pairs of control vertices, each once.
+        on_plane: those that are their own images.
+        deviation: standard deviation in mm.
+    """
+
+    name: ClassVar[str] = "symmetry"
+    uses: ClassVar[tuple[str, ...]] = ("mirror",)
     left: Int[Array | np.ndarray, "m"]
     right: Int[Array | np.ndarray, "m"]
-    """Pairs of control vertices, each once."""
     on_plane: Int[Array | np.ndarray, "o"]
-    plane: Plane
+    partner: Int[Array | np.ndarray, "v"]
     deviation: Float[Array | np.ndarray, ""]
-    lever: Float[Array | np.ndarray, ""] | None
-    """By how much the surface moves, in mm, for a normal that turns by one radian; None where normals are not tied."""
+    with_normals: bool = eqx.field(static=True)
 
-    def rows(self, control: js.Control, xp: Any = np) -> AnyArray:
-        """Departures from symmetry over their standard deviation: three a pair, one a vertex on the plane; likewise
-        those of the normals."""
-        parts: list[AnyArray] = [control.vertices - self.plane.middle[None]]
-        if self.lever is not None:
-            parts.append(self.lever * control.normals)
+    @classmethod
+    def make(cls, priors: Any, start: Start) -> "SymmetryPrior | None":
+        symmetry = start.inputs.get("symmetry")
+        if symmetry is None:
+            return None
+        partner, own = np.asarray(symmetry.partner), np.arange(len(symmetry.partner))
+        left = np.flatnonzero(own < partner)
+        alone = np.flatnonzero(own == partner)
+        return cls(left, partner[left], alone, partner, priors.symmetry, start.has_normals)
+
+    def shared(self) -> dict[str, Shared]:
+        return {"mirror": Shared((3,), lasting=False)}
+
+    def hold(self, place: Place, strengths: dict[str, Array]) -> _Held:
+        vertices = place.control.vertices
+        middle, normal = _plane_of(self.partner, vertices, jnp)
+        turns = jnp.stack(tangents(normal[None]), axis=1)[0]
+        extent = jnp.sqrt(jnp.mean(jnp.sum((vertices - middle[None]) ** 2, axis=1)))
+        return _Held(Plane(middle, normal), turns, extent, _LEVER * js.edge_length(place.topology, vertices))
+
+    def rows(self, place: Place, held: _Held) -> Float[Array, "m"]:
+        """Three a pair, one a vertex on the plane; likewise those of the normals."""
+        shift, turn = place.shared["mirror"][0], place.shared["mirror"][1:] / held.extent
+        normal = unit(held.plane.normal + turn @ held.turns)
+        parts = [place.control.vertices - (held.plane.middle + shift * held.plane.normal)[None]]
+        if self.with_normals:
+            parts.append(held.lever * place.control.normals)
         found = []
         for values in parts:
-            image = values - 2 * (values @ self.plane.normal)[:, None] * self.plane.normal[None]
-            found += [(values[self.left] - image[self.right]).reshape(-1), values[self.on_plane] @ self.plane.normal]
-        return xp.concatenate(found) / self.deviation
+            image = values - 2 * (values @ normal)[:, None] * normal[None]
+            found += [(values[self.left] - image[self.right]).reshape(-1), values[self.on_plane] @ normal]
+        return jnp.concatenate(found)
+
+    def precisions(self, strengths: dict[str, Array]) -> Any:
+        return self.deviation**-2
+
+    def vertices(self) -> Int[np.ndarray, "m 2"]:
+        pairs = np.repeat(np.stack([self.left, self.right], axis=1), 3, axis=0)
+        alone = np.stack([self.on_plane, np.full(len(self.on_plane), -1)], axis=1)
+        return np.concatenate([pairs, alone] * (2 if self.with_normals else 1))
 
 
-class Ties(NamedTuple):
-    """The rows of a mirror about one place, and their derivatives."""
-
-    rows: Float[np.ndarray, "m"]
-    by: sp.csr_array
-    """By the unknowns `[m, n]`, the plane held."""
-    by_plane: Float[np.ndarray, "m 3"]
-    """By a shift of the plane and its two turns."""
-
-    def with_plane(self, step: Float[np.ndarray, "n"], solve: Solve, is_free: np.ndarray) -> Float[np.ndarray, "n"]:
-        """The step of unknowns and plane together, from the step with the plane held.
-
-        Without it a strong prior would hold a mesh that starts beside its place where it is: the plane, found from the
-        vertices, would follow them, and they it, little by little.
-
-        Args:
-            solve: with the matrix of the step with the plane held.
-            is_free: which unknowns it is of.
-        """
-        across = self.by.T @ self.by_plane
-        moved = solve(across[is_free])
-        own = self.by_plane.T @ self.by_plane - across[is_free].T @ moved
-        shift = np.linalg.lstsq(own, -(self.by_plane.T @ self.rows + across.T @ step), rcond=None)[0]
-        step = step.copy()
-        step[is_free] -= moved @ shift
-        return step
-
-
-def mirror_at(
-    symmetry: Symmetry, deviation: float, topology: js.Topology, control: js.Control, zero: Unknowns
-) -> Mirror:
-    """The prior about a control mesh, whose best plane it takes.
-
-    Args:
-        deviation: standard deviation in mm.
-        zero: the unknowns.
-    """
-    partner, own = np.asarray(symmetry.partner), np.arange(len(symmetry.partner))
-    left = np.flatnonzero(own < partner)
-    vertices = np.asarray(control.vertices, np.float64)
-    return Mirror(
-        left,
-        partner[left],
-        np.flatnonzero(own == partner),
-        _plane_of(partner, vertices),
-        np.asarray(float(deviation)),
-        None if zero.normals is None else np.asarray(_LEVER * float(js.edge_length(topology, control.vertices))),
-    )
-
-
-def ties(mirror: Mirror, control: js.Control, zero: Unknowns) -> Ties:
-    """Rows and derivatives about a control whose normals are unit."""
-    vertices, normals = (np.asarray(part, np.float64) for part in (control.vertices, unit(control.normals)))
-    rows = mirror.rows(js.Control(vertices, normals))
-    n_vertices, width = len(vertices), 3 * (zero.vertices is not None) + 2 * (zero.normals is not None)
-    n = n_vertices * width + (0 if zero.h is None else zero.h.size)
-    left, right, alone, m = (np.asarray(part) for part in (*mirror[:3], mirror.plane.normal))
-
-    def picked(which: Int[np.ndarray, "k"]) -> sp.csr_array:
-        return sp.csr_array((np.ones(len(which)), (np.arange(len(which)), which)), shape=(len(which), n_vertices))
-
-    pairs = sp.kron(picked(left), np.eye(3)) - sp.kron(picked(right), np.eye(3) - 2 * np.outer(m, m))
-    fold = sp.vstack([pairs, sp.kron(picked(alone), m[None])])
-    # How three coordinates a vertex move with the unknowns: of the vertices, then of the normals times the lever.
-    at, blocks = np.arange(n_vertices), []
-    if zero.vertices is None:
-        blocks.append(sp.csr_array((3 * n_vertices, n)))
-    else:
-        blocks.append(_placed(np.tile(np.eye(3), (n_vertices, 1, 1)), width * at, n))
-    parts = [(vertices - mirror.plane.middle, 1.0)]
-    if mirror.lever is not None:
-        parts.append((float(mirror.lever) * normals, 0.0))
-        both = np.stack([np.asarray(part, np.float64) for part in tangents(unit(control.normals))], axis=2)
-        blocks.append(_placed(both, width * at + width - 2, n))  # the unknowns are scaled by the lever
-    by = sp.vstack([fold @ block for block in blocks]).tocsr() / float(mirror.deviation)
-
-    u, w = np.linalg.svd(m[None])[2][1:]
-    by_plane = []
-    for values, shifts in parts:
-        there = values[right]
-        turns = [2 * ((there @ t)[:, None] * m + (there @ m)[:, None] * t) for t in (u, w)]
-        of_pairs = np.stack([np.tile(-2 * shifts * m, (len(there), 1)), *turns], axis=2).reshape(-1, 3)
-        of_alone = np.stack([np.full(len(alone), -shifts), values[alone] @ u, values[alone] @ w], axis=1)
-        by_plane += [of_pairs, of_alone]
-    return Ties(rows, by, np.concatenate(by_plane) / float(mirror.deviation))
-
-
-def _placed(blocks: Float[np.ndarray, "v 3 c"], first: Int[np.ndarray, "v"], n: int) -> sp.csr_array:
-    """Rows of three a vertex, each block from its first column on."""
-    n_vertices, _, width = blocks.shape
-    columns = np.broadcast_to((first[:, None] + np.arange(width))[:, None], blocks.shape)
-    ends = np.arange(0, 3 * n_vertices * width + 1, width)
-    return sp.csr_array((blocks.ravel(), columns.ravel(), ends), shape=(3 * n_vertices, n))
-
-
-def _plane_of(partner: Int[np.ndarray, "v"], vertices: Float[np.ndarray, "v 3"]) -> Plane:
+def _plane_of(partner: AnyArray, vertices: AnyArray, xp: Any = np) -> Plane:
     """The plane that leaves the least between vertices and the mirror images of their partners.
 
     It goes through their middle; with the pairs (a, b) about that, the squares add up to a constant and four times the
     sum of (m . a) (m . b), for the normal m.
     """
     middle = vertices.mean(axis=0)
-    y = vertices - middle
+    y = vertices - middle[None]
     products = y.T @ y[partner]
-    return Plane(middle, np.linalg.eigh(products + products.T)[1][:, 0])
+    return Plane(middle, xp.linalg.eigh(products + products.T)[1][:, 0])
 
 
 def _candidates(vertices: Float[np.ndarray, "v 3"], near: float) -> Iterator[Plane]:

@@ -1,0 +1,136 @@
+"""What a prior is: rows that a fit makes small beside the distances, and what they depend on.
+
+A prior is one file in this folder: its rows, in JAX, its tables, in numpy, and its precisions. One line in the register
+of `fitting/model/priors/__init__.py` makes it part of fits, cohorts, saved fits, recipes and posteriors.
+
+Half the squared sum of all rows, each over its standard deviation, is the negative logarithm of a probability: of the
+scan given the surface, times that of the surface.
+"""
+
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+import jaxsubdiv as js
+
+from ..unknowns import Shared
+
+
+def backend(*values: Any) -> Any:
+    """numpy for values that are known, jax.numpy while a program is traced."""
+    return jnp if any(isinstance(value, jax.core.Tracer) for value in values) else np
+
+
+class Place(NamedTuple):
+    """Where rows are evaluated: the variables, and the surface that they make."""
+
+    scheme: js.AbstractScheme
+    topology: js.Topology
+    control: js.Control
+    shared: dict[str, Array]
+    """Values of the shared unknowns."""
+    surface: js.RefinedSurface | None
+    """None for priors that do not look at it."""
+    template: Float[Array, "v 3"]
+    """Control vertices where the fit started."""
+    edge: Float[Array, ""]
+    """Length of a control edge there, in mm."""
+
+    @property
+    def mesh(self) -> js.RefinedSurface:
+        """A surface that has the control vertices on it: the refined one, or the control mesh of a dual scheme."""
+        if self.scheme.is_primal and self.surface is not None:
+            return self.surface
+        normals = js.estimate_normals(self.topology.control_fans, self.control.vertices)
+        return js.RefinedSurface(self.control.vertices, normals, self.topology.control_faces)
+
+
+class Start(NamedTuple):
+    """Where a fit starts, on the host, and what its user gave: all that a prior makes its tables from."""
+
+    scheme: js.AbstractScheme
+    topology: js.Topology
+    control: js.Control
+    surface: js.RefinedSurface
+    owner: Int[np.ndarray, "g"]
+    """The control face of every face of the surface."""
+    has_normals: bool
+    """Whether any control normal is free."""
+    has_h: bool
+    """Whether h is free."""
+    inputs: dict[str, Any]
+    """What belongs to this scan alone, by name: landmarks, boundary, symmetry, alike, slices."""
+
+
+class AbstractPrior(eqx.Module):
+    """Rows that are small where the surface is as it is expected to be.
+
+    A prior is made by `make(priors, start)`, from the settings `Priors` and what the scan brings; None leaves it out.
+    """
+
+    name: eqx.AbstractClassVar[str]
+
+    @classmethod
+    def make(cls, priors: Any, start: Start) -> "AbstractPrior | None":
+        """The prior with its tables, built in numpy; it may raise."""
+        raise NotImplementedError
+
+    def shared(self) -> dict[str, Shared]:
+        """The unknowns that the prior brings along, which all rows share."""
+        return {}
+
+    def initial(self) -> dict[str, Array]:
+        """Values of those that last, where the fit starts."""
+        return {}
+
+    def hold(self, place: Place, strengths: dict[str, Array]) -> Any:
+        """What stays fixed during a sweep that starts from here: arrays."""
+        return None
+
+    def rows(self, place: Place, held: Any) -> Float[Array, "m"]:
+        """Departures from what is expected, in mm where nothing else is said."""
+        raise NotImplementedError
+
+    def precisions(self, strengths: dict[str, Array]) -> Any:
+        """1 / variance of the rows: an array of them, or one for all."""
+        raise NotImplementedError
+
+    @property
+    def n_strengths(self) -> int:
+        """How many strengths, 1 / variances of its rows, the prior has that a fit finds or anneals."""
+        return 0
+
+    def first_strengths(self) -> Float[np.ndarray, "s"]:
+        """Those of the first sweep."""
+        raise NotImplementedError
+
+    def given_strengths(self) -> Float[np.ndarray, "s"] | None:
+        """Those that the settings ask for; None where they are found from the scan."""
+        return None
+
+    def strength_rows(self) -> Int[np.ndarray, "m"]:
+        """Which strength that of each row is; -1 for rows whose variance is known."""
+        raise NotImplementedError
+
+
+class AbstractFacePrior(AbstractPrior):
+    """A prior each of whose rows depends on the unknowns of one control face's neighbourhood, and on h."""
+
+    def faces(self, held: Any) -> Int[np.ndarray, "m"]:
+        """The control face of every row."""
+        raise NotImplementedError
+
+
+class AbstractVertexPrior(AbstractPrior):
+    """A prior each of whose rows depends on few control vertices anywhere, and on shared unknowns; not on the surface."""
+
+    uses: ClassVar[tuple[str, ...]] = ()
+    """Names of the shared unknowns that its rows depend on."""
+
+    def vertices(self) -> Int[np.ndarray, "m c"]:
+        """The control vertices of every row."""
+        raise NotImplementedError

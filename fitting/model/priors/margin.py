@@ -1,0 +1,50 @@
+"""Control normals do not lean from the faces around them so far that the surface folds."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxsubdiv.linalg import cross, dot, take, unit
+
+from .base import AbstractFacePrior, Place, Start
+
+# A normal that leans less than this, as a cosine, from the faces around it keeps the surface smooth; it may be a little
+# under it, by the softness, at a standard deviation of the spread.
+_MARGIN, _SOFTNESS, _SPREAD = 0.2, 0.1, 0.02
+
+
+class Margin(AbstractFacePrior):
+    """The cosine between a control normal and each face at its vertex stays above a margin; see `js.admissible_margin`."""
+
+    name: ClassVar[str] = "margin"
+    n_triangles: int = eqx.field(static=True)
+    n_quads: int = eqx.field(static=True)
+
+    @classmethod
+    def make(cls, priors: Any, start: Start) -> "Margin | None":
+        if not start.scheme.uses_normals:
+            return None
+        return cls(*(len(start.topology.control_faces[size]) for size in (3, 4)))
+
+    def rows(self, place: Place, held: None) -> Float[Array, "m"]:
+        """One a corner of the control faces, over its own standard deviation."""
+        rows, normals = [], unit(place.control.normals)
+        for _, faces in sorted(place.topology.control_faces.items()):
+            corners = take(
+                place.control.vertices, faces
+            )  # at once: every gather is a loop to compile in the derivative
+            after, before = (jnp.roll(corners, step, axis=1) - corners for step in (-1, 1))
+            rows.append(dot(take(normals, faces), unit(cross(after, before)))[..., 0].T.reshape(-1))
+        margin = jnp.concatenate(rows)
+        return jax.nn.softplus((_MARGIN - margin) / _SOFTNESS) * (_SOFTNESS / _SPREAD)
+
+    def precisions(self, strengths: dict[str, Array]) -> Any:
+        return 1.0
+
+    def faces(self, held: Any) -> Int[np.ndarray, "m"]:
+        quads = self.n_triangles + np.arange(self.n_quads)
+        return np.concatenate([np.tile(np.arange(self.n_triangles), 3), np.tile(quads, 4)])

@@ -1,0 +1,157 @@
+"""Shapes seen before: the control mesh is a mean shape, moved along its modes of variation, and something of its own."""
+
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+import jaxsubdiv as js
+from jaxsubdiv.linalg import cross
+
+from ..modes import Modes
+from ..procrustes import align_shape
+from ..unknowns import Shared
+from .base import AbstractVertexPrior, Place, Start, backend
+
+_FIRST = 0.1  # of a control edge: standard deviation of what the modes leave, in the first sweep
+
+
+class ShapeModes(eqx.Module):
+    """The control meshes of a family: `Priors(shape=...)` takes one, or the `Modes` that `shape_modes` found.
+
+    Attributes:
+        mean: mean control vertices in mm.
+        modes: directions of variation, each of length 1 over all coordinates.
+        deviations: standard deviation of the family along each, in mm over all coordinates.
+        rest: standard deviation in mm, in each coordinate of a control vertex, of what a member has beside the modes;
+            None, the default, where it is found from the scan.
+    """
+
+    mean: Float[Array, "v 3"] = eqx.field(converter=jnp.asarray)
+    modes: Float[Array, "k v 3"] = eqx.field(converter=jnp.asarray)
+    deviations: Float[Array, "k"] = eqx.field(converter=jnp.asarray)
+    rest: Float[Array, ""] | None = eqx.field(
+        converter=lambda value: None if value is None else js.strong_float(value), default=None
+    )
+
+    def __check_init__(self):
+        shape = self.modes.shape[:1] + self.mean.shape
+        if self.mean.ndim != 2 or self.mean.shape[1] != 3 or self.modes.shape != shape or not self.modes.shape[0]:
+            raise ValueError(
+                f"a shape needs a mean [v, 3] and modes [k, v, 3]; got {self.mean.shape}, {self.modes.shape}."
+            )
+        if self.deviations.shape != self.modes.shape[:1] or not bool(jnp.all(self.deviations > 0)):
+            raise ValueError("a shape needs a positive standard deviation for each of its modes.")
+        if self.rest is not None and not bool(self.rest > 0):
+            raise ValueError(f"the standard deviation of the rest must be positive; got {self.rest}.")
+
+    @staticmethod
+    def of(value: "ShapeModes | Modes | None") -> "ShapeModes | None":
+        """From what `shape_modes` found: those modes that the family varies along."""
+        if not isinstance(value, Modes):
+            return value
+        some = value.deviations > 1e-6 * value.deviations.max()
+        return ShapeModes(value.mean, value.modes[some], value.deviations[some])
+
+
+class _Held(NamedTuple):
+    """What a sweep holds of the prior."""
+
+    shape: Float[Array, "v 3"]
+    """The member of the family with the scores where the sweep starts, moved to the mesh as a whole."""
+    modes: Float[Array, "k v 3"]
+    """By how much a score moves it, turned likewise."""
+    scores: Float[Array, "k"]
+    middle: Float[Array, "3"]
+    extent: Float[Array, ""]
+    """Size of the mesh in mm: a turn of 1 / extent moves its outer parts by 1 mm."""
+
+
+class ShapePrior(AbstractVertexPrior):
+    """Control vertices lie where the family has them, by scores that a step solves for, give or take the rest.
+
+    The scores are Gaussian, of standard deviation 1 in the deviations of the modes. The pose, rigid, is solved for too.
+
+    Attributes:
+        mean: in mm.
+        modes: displacements in mm at a score of 1.
+        rest: standard deviation in mm of what the modes leave, or None where it is found from the scan.
+    """
+
+    name: ClassVar[str] = "shape"
+    uses: ClassVar[tuple[str, ...]] = ("scores", "pose")
+    mean: Float[Array, "v 3"]
+    modes: Float[Array, "k v 3"]
+    rest: Float[Array, ""] | None
+    widest: float = eqx.field(static=True)
+    """How far the widest mode moves a vertex, root mean square, in control edges."""
+    edge: float = eqx.field(static=True)
+    """Length of a control edge in mm."""
+
+    @classmethod
+    def make(cls, priors: Any, start: Start) -> "ShapePrior | None":
+        shape = priors.shape
+        if shape is None:
+            return None
+        if shape.mean.shape != start.control.vertices.shape:
+            raise ValueError(
+                f"`Priors.shape` is of meshes of {len(shape.mean)} control vertices; this one has "
+                f"{len(start.control.vertices)}. Take the modes of control meshes that correspond to it."
+            )
+        edge = float(js.edge_length(start.topology, start.control.vertices))
+        widest = float(shape.deviations.max()) / len(shape.mean) ** 0.5
+        dtype = start.control.vertices.dtype
+        modes = (shape.modes * shape.deviations[:, None, None]).astype(dtype)
+        return cls(shape.mean.astype(dtype), modes, shape.rest, widest / edge, edge)
+
+    @property
+    def n_strengths(self) -> int:
+        return 1
+
+    def first_strengths(self) -> Float[np.ndarray, "1"]:
+        xp = backend(self.rest)
+        return xp.full(1, xp.asarray(_FIRST * self.edge if self.rest is None else self.rest) ** -2.0)
+
+    def given_strengths(self) -> Float[np.ndarray, "1"] | None:
+        return None if self.rest is None else self.first_strengths()
+
+    def strength_rows(self) -> Int[np.ndarray, "m"]:
+        return np.append(np.zeros(self.mean.size, int), np.full(len(self.modes), -1))
+
+    def shared(self) -> dict[str, Shared]:
+        return {"scores": Shared((len(self.modes),), lever=self.widest), "pose": Shared((6,), lasting=False)}
+
+    def initial(self) -> dict[str, Array]:
+        return {"scores": jnp.zeros(len(self.modes), self.mean.dtype)}
+
+    def hold(self, place: Place, strengths: dict[str, Array]) -> _Held:
+        vertices, scores = place.control.vertices, place.shared["scores"].astype(self.mean.dtype)
+        shape = self.mean + jnp.tensordot(scores, self.modes, 1)
+        there = align_shape(shape, vertices, jnp, scale=False)
+        middle = there.mean(axis=0)
+        # A rigid motion of the shape turns each mode as a vector: by the motion of the shape with it, less that without.
+        a, b = shape - shape.mean(axis=0)[None], there - middle[None]
+        u, _, vt = jnp.linalg.svd(b.T @ a)
+        turn = u @ vt
+        extent = jnp.sqrt(jnp.mean(jnp.sum(b**2, axis=1)))
+        return _Held(there, self.modes @ turn.T, scores, middle, extent)
+
+    def rows(self, place: Place, held: _Held) -> Float[Array, "m"]:
+        """Three a control vertex in mm, and then the scores."""
+        scores, pose = place.shared["scores"].astype(self.mean.dtype), place.shared["pose"]
+        member = held.shape + jnp.tensordot(scores - held.scores, held.modes, 1) + pose[None, :3]
+        arms = held.shape - held.middle[None]
+        turned = cross(jnp.broadcast_to(pose[None, 3:] / held.extent, arms.shape), arms)
+        return jnp.concatenate([(place.control.vertices - member - turned).reshape(-1), scores])
+
+    def precisions(self, strengths: dict[str, Array]) -> Any:
+        xp = jnp if isinstance(strengths[self.name], Array) else np
+        n, k = self.mean.size, len(self.modes)
+        of_rest = xp.broadcast_to(xp.asarray(strengths[self.name])[0], (n,))
+        return xp.concatenate([of_rest, xp.ones(k, of_rest.dtype)])
+
+    def vertices(self) -> Int[np.ndarray, "m 1"]:
+        rows = np.append(np.repeat(np.arange(len(self.mean)), 3), np.full(len(self.modes), -1))
+        return rows[:, None]

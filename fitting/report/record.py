@@ -1,0 +1,119 @@
+"""All that a fit found and was made from: data alone, which reports, posteriors and saved fits read."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Bool, Float, Int
+
+import jaxsubdiv as js
+
+from ..model.pairing import Look, Scene
+from ..model.recipe import Settings
+from ..model.residual import Held, Model
+from ..model.unknowns import Variables
+from ..scan.scan import Scan
+from ..solve.sparse_normal import SparseEquations, find_structure
+from ..solve.strengths import Strengths
+from ..solve.sweeps import HOLD, active_unknowns, hold_priors, hold_sweep, loose_damping, measure_look
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """A fit where it ended.
+
+    Attributes:
+        model: what was fitted.
+        y: the variables found.
+        scene: the scan, as the fit looked at it.
+        look: what it saw from the surface found.
+        strengths: of the priors.
+        hold: what damped the unknowns in the last sweep, `[n]`.
+        shifting: whether slices were free to be shifted.
+        scan: as it was given.
+        start: the control where the fit started, with the normals that it took.
+        inputs: what belongs to the scan alone, by name; see `Start.inputs`.
+        settings: what the fit was told.
+        rms, robust_rms: of the distances in mm, at the start and after every sweep.
+        result: why it ended.
+    """
+
+    model: Model
+    y: Variables
+    scene: Scene
+    look: Look
+    strengths: Strengths
+    hold: Float[np.ndarray, "n"]
+    shifting: bool
+    scan: Scan
+    start: js.Control
+    inputs: dict[str, Any]
+    settings: Settings
+    rms: Float[np.ndarray, "sweeps"]
+    robust_rms: Float[np.ndarray, "sweeps"]
+    result: optx.RESULTS
+
+    @property
+    def topology(self) -> js.Topology:
+        """Tables of the control mesh."""
+        return self.model.topology
+
+    @property
+    def active(self) -> Bool[np.ndarray, "k"]:
+        """Which shared unknowns took part."""
+        return active_unknowns(self.model, np.asarray(self.shifting))
+
+    @property
+    def loose(self) -> Float[np.ndarray, "n"]:
+        """The damping of unknowns that go on."""
+        return loose_damping(self.model)
+
+    @property
+    def last_hold(self) -> Float[np.ndarray, "n"]:
+        """What damped the unknowns in the last sweep, but no faster than by one turn back."""
+        return np.minimum(self.hold, HOLD * self.loose)
+
+    @property
+    def likeness(self) -> float:
+        """The likeness, as a mean over all bends: those of a mesh that was split are mostly not expected."""
+        bend: Any = self.model.prior("bend")
+        return float(self.strengths.values["likeness"]) * float(np.mean(np.asarray(bend.template) != 0))
+
+    @property
+    def shifts(self) -> Float[np.ndarray, "s 3"]:
+        """How far each slice was shifted in mm; no row where none was free."""
+        if not self.shifting or "shifts" not in self.y.shared:
+            return np.zeros((0, 3))
+        prior: Any = self.model.prior("shift")
+        return np.einsum("sj,sjx->sx", np.asarray(self.y.shared["shifts"], np.float64), np.asarray(prior.planes))
+
+    @property
+    def slices(self) -> Int[np.ndarray, "s"]:
+        """Their numbers."""
+        prior: Any = self.model.prior("shift")
+        return np.asarray(prior.numbers)[: len(self.shifts)] if prior is not None else np.zeros(0, int)
+
+    def surface(self) -> js.RefinedSurface:
+        """The surface found."""
+        return self.model.refine(self.y)
+
+    def held(self) -> Held:
+        """What the sweep after the last would hold fixed: the `args` of its residual."""
+        held, _ = hold_priors(self.model, self.y, self.surface(), self.strengths.values, self.scene)
+        return hold_sweep(self.model, self.y, self.scene, self.look, self.look.at, self.strengths, held)
+
+    def equations(self) -> SparseEquations:
+        """The normal equations about the surface found."""
+        held = self.held()
+        structure, found = find_structure(self.model, self.y, held.priors)
+        return SparseEquations(structure, self.model, self.y, held, found)
+
+
+def look_at(model: Model, y: Variables, scene: Scene, loss: Any) -> Look:
+    """The scan as seen from a surface, the loss at the scale of the noise."""
+    strengths = {"likeness": jnp.zeros(())} | {
+        one.name: one.first_strengths() for one in model.priors if one.n_strengths
+    }
+    return measure_look(model, y, model.refine(y), scene, loss, strengths)
