@@ -107,8 +107,8 @@ class Fit:
     def equations(self) -> SparseEquations:
         """The normal equations about the surface found."""
         held = self.held()
-        structure, found = find_structure(self.model, self.y, held.priors)
-        return SparseEquations(structure, self.model, self.y, held, found)
+        structure = find_structure(self.model, self.y, held.priors, coarse=False)
+        return SparseEquations(structure, self.model, self.y, held)
 
 
 def look_at(model: Model, y: Variables, scene: Scene, loss: Any) -> Look:

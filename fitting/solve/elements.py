@@ -7,7 +7,6 @@ equations are sums of small dense matrices, one a face. Which vertices belong to
 """
 
 import math
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -19,11 +18,10 @@ from jaxtyping import Array, Float, Int
 
 import jaxsubdiv as js
 
-from ..model.residual import Model, Pairs, signed_distances
+from ..model.residual import Model, Pairs
 from ..model.unknowns import Layout, Unknowns, Variables
 
 _ROWS_A_BLOCK = 24
-_PAIRS_AT_ONCE = 65_536  # bounds the memory to a few hundred MB, however large the scan is
 _ENTRIES_AT_ONCE = 1 << 22  # of the faces' matrices, likewise
 _ONE_THREAD = 1 << 18  # multiplications of a product that OpenBLAS leaves to one
 _WRONG = 1e-3  # of a derivative: far more than rounding in float32, far less than a forgotten control vertex
@@ -168,21 +166,6 @@ def differentiate(
     return Derivatives(surface, rows, by_rows, by_surface, (of_surface[-1], of_rows[-1]))
 
 
-@jax.jit
-def differentiate_distances(
-    found: Derivatives, pairs: Pairs, face: Int[Array | np.ndarray, "p"], slots: Int[Array | np.ndarray, "p 4"]
-) -> tuple[Float[Array, "p"], Float[Array, "p d"]]:
-    """Distances from the surface, and their derivatives.
-
-    Args:
-        face: the control face of each pair.
-        slots: where in its patch each of the corners stands.
-    """
-    factors = pairs.corner_weights[:, :, None] * pairs.directions[:, None, :]
-    a, b, c, d = (jnp.einsum("pdx,px->pd", found.by_surface[face, slots[:, i]], factors[:, i]) for i in range(4))
-    return signed_distances(found.surface, pairs), (a + b) + (c + d)
-
-
 def forgets_some(elements: Elements, patches: Patches, found: Derivatives, row_faces: Int[np.ndarray, "m"]) -> bool:
     """Whether values depend on unknowns that the elements do not know: seen in the derivative along the last seed."""
     seed = np.append(elements.seeds[-1, : elements.n], 0.0)[elements.columns]
@@ -245,15 +228,15 @@ class _Sums:
         return self._lower[self._place]
 
 
-def equations_of_many(
+def distance_matrix(
     elements: Elements,
     patches: Patches,
-    found: Derivatives,
+    by_surface: Float[Array, "f w d 3"],
     pairs: Pairs,
     weights: Float[np.ndarray, "p"],
     at: Int[np.ndarray, "p"],
-) -> tuple[Float[np.ndarray, "_"], Float[np.ndarray, "n"]]:
-    """J' W J and J' W times the distances, of more pairs than the patches have vertices.
+) -> Float[np.ndarray, "_"]:
+    """Values of J' W J for the distances of pairs, in the pattern of the elements.
 
     A distance depends on three or four vertices of the surface. What the pairs of a patch say of its vertices is summed
     up first, and then taken to the unknowns, once a patch and not once a pair.
@@ -261,30 +244,34 @@ def equations_of_many(
     Args:
         at: the face of the surface of each pair.
     """
-    distances = np.asarray(jax.jit(signed_distances)(found.surface, pairs), np.float64)
-    corner_weights, directions = (np.asarray(part, np.float64) for part in (pairs.corner_weights, pairs.directions))
-    face, width = patches.owner[at], 3 * patches.vertices.shape[1]
-    order, d = np.argsort(face, kind="stable"), elements.columns.shape[1]
-    sums, gradient = _Sums(elements), np.zeros(elements.n + 1)
+    width, d = 3 * patches.vertices.shape[1], elements.columns.shape[1]
+    face, sums = patches.owner[at], _Sums(elements)
+    order = np.argsort(face, kind="stable")
     for run in elements.runs:
         those = run.faces
         n = those.stop - those.start
         rows = order[slice(*np.searchsorted(face, (those.start, those.stop), sorter=order))]
-        factors = (corner_weights[rows, :, None] * directions[rows, None, :]).reshape(-1, 12)
-        coordinate = (3 * patches.slots[at[rows], :, None] + np.arange(3)).reshape(-1, 12)
+        coordinate, factors = pair_factors(patches, pairs, at, rows)
         place = (face[rows, None] - those.start) * width + coordinate
-        weighted = factors * weights[rows, None]
-        sides = np.bincount(place.ravel(), (weighted * distances[rows, None]).ravel(), n * width)
         inner = np.bincount(
             (place[:, :, None] * width + coordinate[:, None, :]).ravel(),
-            (weighted[:, :, None] * factors[:, None, :]).ravel(),
+            ((factors * weights[rows, None])[:, :, None] * factors[:, None, :]).ravel(),
             n * width * width,
         ).reshape(n, width, width)
-        by = np.asarray(found.by_surface[those], np.float64).transpose(0, 1, 3, 2).reshape(n, width, d)
+        by = np.asarray(by_surface[those], np.float64).transpose(0, 1, 3, 2).reshape(n, width, d)
         sums.add(run, _products(by.transpose(0, 2, 1), _products(inner, by)))
-        by_unknowns = np.matmul(sides.reshape(n, 1, width), by)
-        gradient += np.bincount(elements.columns[those].ravel(), by_unknowns.ravel(), elements.n + 1)
-    return sums.values(), gradient[:-1]
+    return sums.values()
+
+
+def pair_factors(
+    patches: Patches, pairs: Pairs, at: Int[np.ndarray, "p"], rows: Int[np.ndarray, "r"]
+) -> tuple[Int[np.ndarray, "r 12"], Float[np.ndarray, "r 12"]]:
+    """The coordinates of its patch that each distance depends on, and by what factors."""
+    corner_weights, directions = (
+        np.asarray(part)[rows].astype(float) for part in (pairs.corner_weights, pairs.directions)
+    )
+    factors = (corner_weights[:, :, None] * directions[:, None, :]).reshape(-1, 12)
+    return (3 * patches.slots[at[rows], :, None] + np.arange(3)).reshape(-1, 12), factors
 
 
 def times_transposed(
@@ -354,21 +341,3 @@ def _pattern(columns: Int[np.ndarray, "f d"], n: int) -> tuple[sp.csc_array, lis
     order = np.lexsort((rows, columns_))
     indptr = np.searchsorted(columns_[order], np.arange(n + 1))
     return sp.csc_array((both[order], rows[order], indptr), shape=(n, n)), runs
-
-
-def padded(
-    pairs: Pairs, weights: Float[np.ndarray, "p"], face: Int[np.ndarray, "p"]
-) -> Iterator[tuple[Pairs, Float[np.ndarray, "s"], Int[np.ndarray, "s"]]]:
-    """Runs of pairs, the last filled up with pairs of weight 0, so that few programs are compiled for all scans."""
-    n, size = len(weights), _run_length(len(weights))
-    for first in range(0, n, size):
-        rows = np.minimum(np.arange(first, first + size), n - 1)
-        counted = np.where(np.arange(first, first + size) < n, weights[rows], 0.0)
-        yield Pairs(*(jnp.asarray(np.asarray(part)[rows]) for part in pairs)), counted, face[rows]
-
-
-def _run_length(n: int) -> int:
-    if n >= _PAIRS_AT_ONCE:
-        return _PAIRS_AT_ONCE
-    step = 1 << max(n.bit_length() - 3, 0)
-    return -(-n // step) * step

@@ -19,24 +19,23 @@ import jaxsubdiv as js
 
 from ..model.priors import AbstractVertexPrior
 from ..model.priors.shifts import ShiftPrior
-from ..model.residual import Held, Model
+from ..model.residual import Held, Model, Residual
 from ..model.unknowns import Layout, Unknowns, Variables
 from .cholesky import Factor, Symbolic
 from .cholesky import analyse as analyse_pattern
+from .coarse import Coarse, coarsen
 from .elements import (
-    Derivatives,
     Elements,
     Patches,
     colour,
     differentiate,
-    differentiate_distances,
-    equations_of_many,
+    distance_matrix,
     find_elements,
     find_patches,
     forgets_some,
     jacobian,
     normal_matrix,
-    padded,
+    pair_factors,
     times_transposed,
 )
 
@@ -103,6 +102,10 @@ class Structure(eqx.Module):
     """What the analysis of a model finds: the same for all sweeps."""
 
     layout: Layout
+    coarse: Coarse | None
+    """The coarser level whose derivatives make the matrices; None where those of the full surface do."""
+    descendants: int
+    """How many faces of the surface descend from each of the level's."""
     elements: Elements
     patches: Patches
     tied: list[_Tied]
@@ -151,12 +154,18 @@ class Structure(eqx.Module):
         return Arrowhead(inner, matrix[:n, n:].toarray(), matrix[n:, n:].toarray())
 
 
-def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> tuple[Structure, Derivatives]:
-    """Find which unknowns belong to which rows: so few rings of faces that explain all derivatives, which come along.
+def find_structure(model: Model, y: Variables, held: dict[str, Any], *, coarse: bool = True) -> Structure:
+    """Find which unknowns belong to which rows: so few rings of faces that explain all derivatives.
+
+    Args:
+        held: what each prior holds where a fit starts.
+        coarse: whether matrices may come from a coarser level.
 
     Raises:
         ValueError: a face of the scheme depends on too many control vertices.
     """
+    coarser = coarsen(model) if coarse else None
+    full, model = model, model if coarser is None else coarser.model
     surface = model.refine(y)
     owner = js.control_faces_of(model.scheme, model.topology, surface, y.control)
     patches = find_patches(surface, owner, model.topology.n_control_faces)
@@ -187,6 +196,8 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> tuple[St
     fixed = np.asarray(model.is_free)[:n] == 0
     return Structure(
         layout,
+        coarser,
+        4 ** (len(full.topology.levels) - len(model.topology.levels)),
         elements,
         patches,
         tied,
@@ -195,7 +206,7 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> tuple[St
         np.flatnonzero(pattern.indices == column),
         np.flatnonzero(fixed[pattern.indices] | fixed[column]),
         (source, place),
-    ), found
+    )
 
 
 def row_faces(model: Model, held: dict[str, Any]) -> Int[np.ndarray, "m"]:
@@ -231,39 +242,48 @@ def _tie(model: Model, prior: AbstractVertexPrior) -> _Tied:
 @eqx.filter_jit
 def _differentiate_tied(
     model: Model, prior: AbstractVertexPrior, y: Variables, held: Any, seeds: Float[Array | np.ndarray, "s n"]
-) -> tuple[Float[Array, "m"], Float[Array, "s m"]]:
-    """The rows of a prior that ties vertices, and their derivatives along the seeds."""
+) -> Float[Array, "s m"]:
+    """The derivatives of the rows of a prior that ties vertices, along the seeds."""
     dtype, split = y.control.vertices.dtype, model.layout.split
 
     def rows(vector: Float[Array, "n"]) -> Float[Array, "m"]:
         return prior.rows(model.place(model.retract(y, split(vector))), held)
 
-    found, derivative = jax.linearize(rows, jnp.zeros(model.layout.n, dtype))
-    return found, jax.lax.map(derivative, jnp.asarray(seeds, dtype))
+    _, derivative = jax.linearize(rows, jnp.zeros(model.layout.n, dtype))
+    return jax.lax.map(derivative, jnp.asarray(seeds, dtype))
+
+
+@eqx.filter_jit
+def _evaluate(model: Model, y: Variables, held: Held) -> tuple[dict[str, Array], Float[Array, "n"]]:
+    """The rows at a place, before they are weighed, and the exact gradient of half their weighed squared sum."""
+    layout, residual = model.layout, Residual(model)
+    zero = jnp.zeros(layout.n, y.control.vertices.dtype)
+    rows, pull = jax.vjp(lambda vector: residual.rows(model.retract(y, layout.split(vector)), held), zero)
+    precisions = {"distance": held.distance_precisions} | held.precisions
+    (gradient,) = pull({name: jnp.asarray(precisions[name], row.dtype) * row for name, row in rows.items()})
+    return rows, gradient
 
 
 class SparseEquations:
-    """Linearised rows about one place on the host: what scan and priors say of the unknowns."""
+    """Linearised rows about one place on the host: what scan and priors say of the unknowns.
 
-    def __init__(self, structure: Structure, model: Model, y: Variables, held: Held, found: Derivatives | None = None):
-        """
-        Args:
-            found: derivatives, where they are known.
-        """
+    Rows and gradient are those of the full surface; the matrices may be of a coarser level, see `coarsen`.
+    """
+
+    def __init__(self, structure: Structure, model: Model, y: Variables, held: Held):
         self.structure, self.model, self.y, self.held = structure, model, y, held
-        elements, layout = structure.elements, model.layout
-        faces = row_faces(model, held.priors)
-        if found is None:
-            tables = elements.seeds, elements.seeds_of, faces, structure.patches.vertices
-            found = differentiate(model, y, held.priors, *tables)
-        self.found, self._row_faces = found, faces
-        self.gradient = np.zeros(layout.n)
-        self.data = self._add_distances()
-        self.values: dict[str, Float[np.ndarray, "m"]] = {}
+        self._matrix_model = model if structure.coarse is None else structure.coarse.model
+        rows, gradient = _evaluate(model, y, held)
+        self.gradient = np.asarray(gradient, np.float64)
+        self.values = {name: np.asarray(row, np.float64) for name, row in rows.items()}
         """Rows of each prior, before they are weighed."""
+        self._row_faces = row_faces(model, held.priors)
+        tables = structure.elements.seeds, structure.elements.seeds_of, self._row_faces, structure.patches.vertices
+        self.found = differentiate(self._matrix_model, y, held.priors, *tables)
         self._by: dict[str, Float[np.ndarray, "m d"]] = {}
         self._tied_jacobians: dict[str, sp.csr_array] = {}
         self._known: dict[tuple[str, bytes], ArrowheadFactor] = {}
+        self.data = self._add_distances()
         self.prior = self._add_face_priors()
         for tied in structure.tied:
             self.prior = self.prior.plus(self._add_tied(tied))
@@ -367,46 +387,34 @@ class SparseEquations:
         return self.model.layout.n - self.structure.n
 
     def _add_distances(self) -> Arrowhead:
-        """The scan's matrix; its gradient is added to that of all."""
-        structure, held = self.structure, self.held
-        elements, patches, n = structure.elements, structure.patches, structure.elements.n
-        precisions = np.asarray(held.distance_precisions, np.float64)
-        faces = np.asarray(held.faces)
-        n_pairs = len(faces)
-        if held.of_points is None and n_pairs > patches.vertices.size:
-            values, gradient = equations_of_many(elements, patches, self.found, held.pairs, precisions, faces)
-            self.gradient[:n] += gradient
-            return structure.arrange(values, self._n_shared)
-        values, border, first = np.zeros(elements.pattern.nnz), None, 0
-        by_shifts = None if held.of_points is None else self._shift_derivatives()
-        for pairs, weights, at in padded(held.pairs, precisions, faces):
-            face = patches.owner[at]
-            distances, by = differentiate_distances(self.found, pairs, face, patches.slots[at])
-            distances, by = np.asarray(distances, np.float64), np.asarray(by)
-            values += normal_matrix(elements, by, weights, face)
-            self.gradient[:n] += times_transposed(elements, by, weights * distances, face)
-            if by_shifts is not None:
-                points = np.minimum(np.arange(first, first + len(at)), n_pairs - 1)  # the rows of `padded`
-                weighed = sp.csr_array(sp.diags_array(weights) @ by_shifts[points])
-                across = (jacobian(elements, by, face).T @ weighed).toarray()
-                among = (by_shifts[points].T @ weighed).toarray()
-                of_run = across, among, weighed.T @ distances
-                border = of_run if border is None else tuple(a + b for a, b in zip(border, of_run, strict=True))
-                first += len(at)
-        found = structure.arrange(values, self._n_shared)
-        if border is not None:
-            across, among, gradient = border
-            columns = self.model.layout.columns("shifts")
-            shifts, own, n_h = (
-                slice(columns.start - structure.n, columns.stop - structure.n),
-                structure.n,
-                n - structure.n,
-            )
-            found.border[:, shifts] += across[:own]
-            found.corner[:n_h, shifts] += across[own:]
-            found.corner[shifts, :n_h] += across[own:].T
-            found.corner[shifts, shifts] += among
-            self.gradient[columns] += gradient
+        """The scan's matrix."""
+        structure, held, n = self.structure, self.held, self.structure.n
+        elements, patches, by_surface = structure.elements, structure.patches, self.found.by_surface
+        weights, pairs, at = np.asarray(held.distance_precisions, np.float64), held.pairs, np.asarray(held.faces)
+        if structure.coarse is not None:
+            pairs, at = structure.coarse.transfer(pairs, at), at // structure.descendants
+        found = structure.arrange(distance_matrix(elements, patches, by_surface, pairs, weights, at), self._n_shared)
+        if held.of_points is None:
+            return found
+        # How the shifts of slices and the other unknowns move distances together: by way of the patches' vertices.
+        by_shifts = self._shift_derivatives()
+        weighed = sp.csr_array(sp.diags_array(weights) @ by_shifts)
+        coordinate, factors = pair_factors(patches, pairs, at, np.arange(len(at)))
+        f, w = patches.vertices.shape
+        place = patches.owner[at][:, None] * (3 * w) + coordinate
+        ends = np.arange(0, factors.size + 1, 12)
+        by_coordinates = sp.csr_array((factors.ravel(), place.ravel(), ends), shape=(len(at), 3 * w * f))
+        sides = (by_coordinates.T @ weighed).toarray().reshape(f, 3 * w, -1)
+        by = np.asarray(by_surface, np.float64).transpose(0, 1, 3, 2).reshape(f, 3 * w, -1)
+        of_faces = by.transpose(0, 2, 1) @ sides
+        across = np.zeros((elements.n + 1, sides.shape[-1]))
+        np.add.at(across, elements.columns, of_faces)
+        columns, n_h = self.model.layout.columns("shifts"), elements.n - n
+        shifts = slice(columns.start - n, columns.stop - n)
+        found.border[:, shifts] += across[:n]
+        found.corner[:n_h, shifts] += across[n:-1]
+        found.corner[shifts, :n_h] += across[n:-1].T
+        found.corner[shifts, shifts] += (by_shifts.T @ weighed).toarray()
         return found
 
     def _shift_derivatives(self) -> sp.csr_array:
@@ -424,30 +432,27 @@ class SparseEquations:
 
     def _add_face_priors(self) -> Arrowhead:
         elements, held = self.structure.elements, self.held
-        rows, by = (np.asarray(part, np.float64) for part in (self.found.rows, self.found.by_rows))
-        first, weights = 0, []
+        by, first, weights = np.asarray(self.found.by_rows, np.float64), 0, [np.zeros(0)]
         self._rows_of: dict[str, slice] = {}
         for prior in self.model.face_priors:
-            count = len(prior.faces(held.priors[prior.name]))
+            count = len(self.values[prior.name])
             own = slice(first, first + count)
-            self.values[prior.name], self._by[prior.name], self._rows_of[prior.name] = rows[own], by[own], own
+            self._by[prior.name], self._rows_of[prior.name] = by[own], own
             weights.append(np.broadcast_to(np.asarray(held.precisions[prior.name], np.float64), (count,)))
             first += count
-        weights = np.concatenate([np.zeros(0), *weights])
-        n = elements.n
-        self.gradient[:n] += times_transposed(elements, by, weights * rows, self._row_faces)
+        weights = np.concatenate(weights)
         return self.structure.arrange(normal_matrix(elements, by, weights, self._row_faces), self._n_shared)
 
     def _add_tied(self, tied: _Tied) -> Arrowhead:
         prior, layout = self.model.prior(tied.prior), self.model.layout
         assert isinstance(prior, AbstractVertexPrior)
-        rows, by = _differentiate_tied(self.model, prior, self.y, self.held.priors[prior.name], tied.seeds)
-        rows, by = np.asarray(rows, np.float64), np.asarray(by, np.float64)
+        by = _differentiate_tied(self.model, prior, self.y, self.held.priors[prior.name], tied.seeds)
+        by = np.asarray(by, np.float64)
         by = np.take_along_axis(by.T, tied.seeds_of, axis=1) if len(by) else np.zeros(tied.columns.shape)
         found = _sparse(by, tied.columns, layout.n)
-        weights = np.broadcast_to(np.asarray(self.held.precisions[prior.name], np.float64), rows.shape)
-        self.values[prior.name], self._tied_jacobians[prior.name] = rows, found
-        self.gradient += found.T @ (weights * rows)
+        weights = np.asarray(self.held.precisions[prior.name], np.float64)
+        weights = np.broadcast_to(weights, self.values[prior.name].shape)
+        self._tied_jacobians[prior.name] = found
         return self.structure.arrange_sparse(sp.csc_array(found.T @ sp.csr_array(sp.diags_array(weights) @ found)))
 
 
@@ -557,6 +562,6 @@ def _inverse(matrix: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
 
 def sparse_solver(model: Model, y: Variables, held: Held) -> SparseNormal:
     """The sparse normal equations of a residual's rows as a linear solver for `optx.GaussNewton`."""
-    structure, _ = find_structure(model, y, held.priors)
+    structure = find_structure(model, y, held.priors, coarse=False)
     faces = np.concatenate([structure.patches.owner[np.asarray(held.faces)], row_faces(model, held.priors)])
     return SparseNormal(structure, faces)

@@ -97,6 +97,7 @@ class BoundaryPrior(AbstractFacePrior):
     """
 
     name: ClassVar[str] = "rim"
+    needs_full_surface: ClassVar[bool] = True
     points: Float[Array, "b 3"]
     counts: Float[Array, "b"]
     deviation: Float[Array, ""]
