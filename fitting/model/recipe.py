@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from collections.abc import Mapping
-from typing import Any, Self, TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
 import equinox as eqx
 import numpy as np
@@ -21,6 +21,7 @@ _VERSION = 2  # 1 had no settings of `fit_scan`, which then are the defaults
 _SCHEMES = {kind.__name__: kind for kind in js.SCHEMES.values()}
 _LOSSES = {kind.__name__: kind for kind in (Barron, Huber, LeastSquares, Tukey)}
 _M = TypeVar("_M", bound=eqx.Module)
+_S = TypeVar("_S")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +63,7 @@ class Settings:
         return js.build_topology(mesh, self.scheme, self.levels, mesh_normals=self.mesh_normals, limit=self.limit)
 
     @classmethod
-    def of(cls, scheme: js.AbstractScheme, topology: js.Topology, **settings: Any) -> Self:
+    def of(cls: type[_S], scheme: js.AbstractScheme, topology: js.Topology, **settings: Any) -> _S:
         """The recipe of a fit on these tables; `settings` are the other attributes."""
         of_tables = {"mesh_normals": topology.mesh_normals, "limit": topology.limit is not None}
         return cls(scheme, len(topology.levels), **of_tables, **settings)
@@ -85,7 +86,7 @@ class Settings:
         return json.dumps(values, indent=2, allow_nan=False)
 
     @classmethod
-    def from_json(cls, text: str) -> Self:
+    def from_json(cls: type[_S], text: str) -> _S:
         """The recipe of JSON text; what the text leaves out keeps its default, but for the scheme and its levels.
 
         Raises:

@@ -1,6 +1,6 @@
 """What a fit makes small: the distances to the scan, and the rows of its priors."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -86,7 +86,7 @@ class Model(eqx.Module):
         kept = {name: y.shared[name] for name, of in self.layout.shared if of.lasting}
         return Variables(y.control, kept)
 
-    def hold(self, place: Place, strengths: dict[str, Array]) -> dict[str, object]:
+    def hold(self, place: Place, strengths: dict[str, Any]) -> dict[str, object]:
         """What every prior holds fixed during a sweep that starts from here."""
         return {prior.name: prior.hold(place, strengths) for prior in self.priors}
 

@@ -3,7 +3,7 @@
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
 from jaxsubdiv import RefinedSurface, SurfacePoint
@@ -42,7 +42,7 @@ class _Groups(NamedTuple):
     triangles: Int[np.ndarray, "4 g"]
 
 
-def closest_points(surface: RefinedSurface, points: Float[np.ndarray, "p 3"]) -> SurfacePoint:
+def closest_points(surface: RefinedSurface, points: Float[Array | np.ndarray, "p 3"]) -> SurfacePoint:
     """Closest surface point of every point: the face and where in it, not the nearest vertex.
 
     Triangles are searched exactly: a triangle near the point bounds its distance, and every triangle that may lie

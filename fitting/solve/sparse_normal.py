@@ -5,6 +5,7 @@ that all rows share, as h, shifts of slices or scores of shape modes, and B both
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -98,7 +99,8 @@ class _Tied(NamedTuple):
     """`n` where there are fewer than in other rows."""
 
 
-class Structure(eqx.Module):
+@dataclass(frozen=True, eq=False)
+class Structure:
     """What the analysis of a model finds: the same for all sweeps."""
 
     layout: Layout

@@ -12,7 +12,7 @@ estimation and prediction under a selection model, 1975, eq. (8).
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -57,6 +57,7 @@ class Strengths(eqx.Module):
     annealed: Any
 
 
+@runtime_checkable
 class Linearised(Protocol):
     """Rows of a fit about one place, as `SparseEquations` and `OperatorEquations` have them."""
 
@@ -187,7 +188,8 @@ class FromScan(eqx.Module):
             changes.append(xp.where(has_rows, xp.abs(xp.log(clipped / values[prior.name])), 0.0))
             used.append(has_rows)
             values[prior.name] = clipped
-        change = xp.concatenate(changes).sum() / xp.maximum(xp.concatenate(used).sum(), 1)
+        used = xp.concatenate(used).astype(step.dtype)
+        change = xp.concatenate(changes).sum() / xp.maximum(used.sum(), 1)
         settled += [change < _SETTLED, xp.abs(values["likeness"] - likeness) < _SETTLED_LIKENESS]
         return Strengths(values, strengths.determined, xp.all(xp.stack([xp.asarray(one) for one in settled])))
 
@@ -286,14 +288,14 @@ def _next_of_family(
 ) -> AnyArray:
     """Next strengths, from how many rows the data determine on each face, and the squares that are left of all."""
     # Where the scan says nothing, in a hole, the surface is as smooth as elsewhere.
-    shared = _SHARE_OF_ALL * determined.sum() / xp.maximum(has_rows.sum(), 1)
-    weights = determined + (shared + _TINY) * has_rows + _TINY
+    counted = has_rows.astype(precision.dtype)
+    shared = _SHARE_OF_ALL * determined.sum() / xp.maximum(counted.sum(), 1)
+    weights = determined + (shared + _TINY) * counted + _TINY
     usual = xp.exp(xp.sum(weights * xp.log(precision)) / xp.sum(weights))
     found = (shared + determined) / xp.maximum(shared / usual + left, _TINY)
     changed = precision * xp.clip(found / precision, 1 / _LARGEST_CHANGE, _LARGEST_CHANGE)
     # Means of the logarithms: means of the bends would be those of the one ear or rim in a neighbourhood, and leave
     # noise in all of it. Edges that are not halved belong to one face of two, and the other has no rows.
-    counted = has_rows.astype(precision.dtype)
     votes = average(counted)
     means = average(xp.log(xp.where(has_rows, changed, 1.0))) / xp.where(votes > 0, votes, 1)
     # Rows in holes alone: nothing is known of them.

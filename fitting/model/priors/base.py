@@ -87,7 +87,7 @@ class AbstractPrior(eqx.Module):
         """Values of those that last, where the fit starts."""
         return {}
 
-    def hold(self, place: Place, strengths: dict[str, Array]) -> Any:
+    def hold(self, place: Place, strengths: dict[str, Any]) -> Any:
         """What stays fixed during a sweep that starts from here: arrays."""
         return None
 
@@ -95,7 +95,7 @@ class AbstractPrior(eqx.Module):
         """Departures from what is expected, in mm where nothing else is said."""
         raise NotImplementedError
 
-    def precisions(self, strengths: dict[str, Array]) -> Any:
+    def precisions(self, strengths: dict[str, Any]) -> Any:
         """1 / variance of the rows: an array of them, or one for all."""
         raise NotImplementedError
 

@@ -68,7 +68,7 @@ class Bend(AbstractFacePrior):
     def strength_rows(self) -> Int[np.ndarray, "b"]:
         return self.of_rows
 
-    def hold(self, place: Place, strengths: dict[str, Array]) -> Float[Array, "b"]:
+    def hold(self, place: Place, strengths: dict[str, Any]) -> Float[Array, "b"]:
         """What is expected, at the size that the mesh has here."""
         by = growth(place) * jnp.asarray(strengths["likeness"], place.edge.dtype)
         return by * jnp.asarray(self.template, place.edge.dtype)
@@ -76,7 +76,7 @@ class Bend(AbstractFacePrior):
     def rows(self, place: Place, held: Float[Array, "b"]) -> Float[Array, "b"]:
         return bend_asymmetry(place.mesh, self.edges) - held
 
-    def precisions(self, strengths: dict[str, Array]) -> Any:
+    def precisions(self, strengths: dict[str, Any]) -> Any:
         return strengths[self.name][self.of_rows]
 
     def faces(self, held: Any) -> Int[np.ndarray, "b"]:

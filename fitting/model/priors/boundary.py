@@ -117,7 +117,7 @@ class BoundaryPrior(AbstractFacePrior):
         counts = jnp.asarray(start.inputs.get("boundary_counts", np.ones(len(points))), points.dtype)
         return cls(points, counts, deviation, ends, start.owner[face], np.unique(ends))
 
-    def hold(self, place: Place, strengths: dict[str, Array]) -> Rim:
+    def hold(self, place: Place, strengths: dict[str, Any]) -> Rim:
         assert place.surface is not None
         return pair_with_boundary(self, place.surface, place.edge)
 
@@ -129,7 +129,7 @@ class BoundaryPrior(AbstractFacePrior):
         across = [dot(held.directions[:, i], away)[:, 0] for i in (0, 1)]
         return jnp.stack(across, axis=1).reshape(-1) / self.deviation
 
-    def precisions(self, strengths: dict[str, Array]) -> Any:
+    def precisions(self, strengths: dict[str, Any]) -> Any:
         return self.counts.repeat(2)
 
     def faces(self, held: Rim) -> Int[np.ndarray, "m"]:

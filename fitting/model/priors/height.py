@@ -45,19 +45,20 @@ class Height(AbstractFacePrior):
         return self.n_faces
 
     def first_strengths(self) -> Float[np.ndarray, "f"]:
-        return first_strengths(backend(self.template).mean(self.template**2), self.n_faces)
+        xp = backend(self.template)
+        return first_strengths(xp.asarray(xp.mean(self.template**2)), self.n_faces)
 
     def strength_rows(self) -> Int[np.ndarray, "g"]:
         return self.of_rows
 
-    def hold(self, place: Place, strengths: dict[str, Array]) -> Float[Array, "g"]:
+    def hold(self, place: Place, strengths: dict[str, Any]) -> Float[Array, "g"]:
         """What is expected, at the size that the mesh has here."""
         return growth(place) * jnp.asarray(self.template, place.edge.dtype)
 
     def rows(self, place: Place, held: Float[Array, "g"]) -> Float[Array, "g"]:
         return bend_height(place.mesh, self.edges) - held
 
-    def precisions(self, strengths: dict[str, Array]) -> Any:
+    def precisions(self, strengths: dict[str, Any]) -> Any:
         return strengths[self.name][self.of_rows]
 
     def faces(self, held: Any) -> Int[np.ndarray, "g"]:

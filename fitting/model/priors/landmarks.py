@@ -46,7 +46,7 @@ class LandmarkPrior(AbstractFacePrior):
         on = js.sum_corners(place.surface.vertices, self.corners, self.corner_weights)
         return ((on - self.points) / self.deviations[:, None]).reshape(-1)
 
-    def precisions(self, strengths: dict[str, Array]) -> Any:
+    def precisions(self, strengths: dict[str, Any]) -> Any:
         return 1.0
 
     def faces(self, held: Any) -> Int[np.ndarray, "m"]:

@@ -42,7 +42,7 @@ class Margin(AbstractFacePrior):
         margin = jnp.concatenate(rows)
         return jax.nn.softplus((_MARGIN - margin) / _SOFTNESS) * (_SOFTNESS / _SPREAD)
 
-    def precisions(self, strengths: dict[str, Array]) -> Any:
+    def precisions(self, strengths: dict[str, Any]) -> Any:
         return 1.0
 
     def faces(self, held: Any) -> Int[np.ndarray, "m"]:

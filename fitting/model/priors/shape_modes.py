@@ -126,7 +126,7 @@ class ShapePrior(AbstractVertexPrior):
     def initial(self) -> dict[str, Array]:
         return {"scores": jnp.zeros(len(self.modes), self.mean.dtype)}
 
-    def hold(self, place: Place, strengths: dict[str, Array]) -> _Held:
+    def hold(self, place: Place, strengths: dict[str, Any]) -> _Held:
         vertices, scores = place.control.vertices, place.shared["scores"].astype(self.mean.dtype)
         shape = self.mean + jnp.tensordot(scores, self.modes, 1)
         there = align_shape(shape, vertices, jnp, scale=False)
@@ -146,7 +146,7 @@ class ShapePrior(AbstractVertexPrior):
         turned = cross(jnp.broadcast_to(pose[None, 3:] / held.extent, arms.shape), arms)
         return jnp.concatenate([(place.control.vertices - member - turned).reshape(-1), scores])
 
-    def precisions(self, strengths: dict[str, Array]) -> Any:
+    def precisions(self, strengths: dict[str, Any]) -> Any:
         xp = jnp if isinstance(strengths[self.name], Array) else np
         n, k = self.mean.size, len(self.modes)
         of_rest = xp.broadcast_to(xp.asarray(strengths[self.name])[0], (n,))

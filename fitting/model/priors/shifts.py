@@ -65,7 +65,7 @@ class ShiftPrior(AbstractVertexPrior):
         """The shifts in mm, slice by slice."""
         return place.shared["shifts"].reshape(-1)
 
-    def precisions(self, strengths: dict[str, Array]) -> Any:
+    def precisions(self, strengths: dict[str, Any]) -> Any:
         return self.deviation**-2
 
     def vertices(self) -> Int[np.ndarray, "m 0"]:

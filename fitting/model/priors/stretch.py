@@ -32,7 +32,9 @@ class Stretch(AbstractFacePrior):
         edges, faces = js.control_edges(start.topology)
         return cls(edges, faces, priors.stretch)
 
-    def hold(self, place: Place, strengths: dict[str, Array]) -> tuple[Float[Array, "e 3"], ...]:
+    def hold(
+        self, place: Place, strengths: dict[str, Any]
+    ) -> tuple[Float[Array, "e 3"], Float[Array, "e 3"], Float[Array, "e 1"]]:
         """The template's edges, moved along with the mesh; directions across the surface; and lengths."""
         moved = align_shape(place.template, place.control.vertices, jnp)
         a, b = jnp.asarray(self.edges).T
@@ -42,14 +44,14 @@ class Stretch(AbstractFacePrior):
         length = jnp.maximum(norm(before), 1e-3 * js.edge_length(place.topology, moved))
         return before, across, length
 
-    def rows(self, place: Place, held: tuple[Float[Array, "e 3"], ...]) -> Float[Array, "m"]:
+    def rows(self, place: Place, held: tuple[Array, Array, Array]) -> Float[Array, "m"]:
         """Three a control edge."""
         before, across, length = held
         a, b = jnp.asarray(self.edges).T
         change = take(place.control.vertices, b) - take(place.control.vertices, a) - before
         return ((change - dot(across, change) * across) / length).reshape(-1)
 
-    def precisions(self, strengths: dict[str, Array]) -> Any:
+    def precisions(self, strengths: dict[str, Any]) -> Any:
         return self.deviation**-2
 
     def faces(self, held: Any) -> Int[np.ndarray, "m"]:

@@ -163,7 +163,7 @@ class SymmetryPrior(AbstractVertexPrior):
     def shared(self) -> dict[str, Shared]:
         return {"mirror": Shared((3,), lasting=False)}
 
-    def hold(self, place: Place, strengths: dict[str, Array]) -> _Held:
+    def hold(self, place: Place, strengths: dict[str, Any]) -> _Held:
         vertices = place.control.vertices
         middle, normal = _plane_of(self.partner, vertices, jnp)
         turns = jnp.stack(tangents(normal[None]), axis=1)[0]
@@ -183,7 +183,7 @@ class SymmetryPrior(AbstractVertexPrior):
             found += [(values[self.left] - image[self.right]).reshape(-1), values[self.on_plane] @ normal]
         return jnp.concatenate(found)
 
-    def precisions(self, strengths: dict[str, Array]) -> Any:
+    def precisions(self, strengths: dict[str, Any]) -> Any:
         return self.deviation**-2
 
     def vertices(self) -> Int[np.ndarray, "m 2"]:

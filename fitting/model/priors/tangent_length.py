@@ -37,7 +37,7 @@ class TangentLength(AbstractVertexPrior):
     def rows(self, place: Place, held: None) -> Float[Array, "n"]:
         return jnp.atleast_1d(place.shared["h"]).astype(place.edge.dtype) - 1
 
-    def precisions(self, strengths: dict[str, Array]) -> Any:
+    def precisions(self, strengths: dict[str, Any]) -> Any:
         return self.deviation**-2
 
     def vertices(self) -> Int[np.ndarray, "n 0"]:
