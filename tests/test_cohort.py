@@ -144,6 +144,62 @@ def test_smoothness_is_that_of_the_pilot():
     assert off(pilot.surface, surface(found, 0)) < 0.3 * off(truths()[0], pilot.surface)
 
 
+def test_every_prior_holds_as_in_a_fit():
+    """Landmarks, symmetry, shifts of slices and shape modes together; of other numbers from subject to subject."""
+    problem, rng = scans.problem(), np.random.default_rng(5)
+    shapes = np.asarray(problem.truth.vertices) * (1 + rng.normal(scale=0.04, size=(6, 1, 3)))
+    priors = fitting.Priors(bend=0.5, symmetry=1.0, shape=fitting.ShapeModes.of(fitting.shape_modes(shapes)))
+    own_scans, places = [], []
+    for i, scan in enumerate(subjects()[::2]):
+        points = np.array(scan.points)
+        slices = np.digitize(points[:, 2], np.linspace(-12, 12, 5 - i))
+        points[slices == 2, :2] += 1.0
+        own_scans.append(fitting.Scan(points, slices=slices))
+        rows = np.arange(3 - i)
+        places.append(fitting.Landmarks(np.asarray(truths()[2 * i].vertices)[rows], rows))
+    options = {"priors": priors, "landmark_deviation": 0.5}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # few slices, and many unknowns: some are still on their way
+        found = fitted(own_scans, landmarks=places, **options)
+    for i, scan in enumerate(own_scans):
+        single = fitting.fit(
+            js.Interpolating(), problem.topology, start(), scan, landmarks=places[i], throw=False, **options
+        )
+        result = found.result(i)
+        assert off(single.surface, result.surface) < 0.3 * off(truths()[2 * i], single.surface)
+        assert result.shifts.shape == single.shifts.shape
+        # The shift that all slices have in common moves with the surface, by less than the noise.
+        own, others = (rows - rows.mean(axis=0) for rows in (result.shifts, single.shifts))
+        np.testing.assert_allclose(own, others, atol=0.1)
+        np.testing.assert_allclose(result.fit.y.shared["scores"], single.fit.y.shared["scores"], atol=0.1)
+
+
+def test_boundary_curves_hold_as_in_a_fit():
+    vertices, faces = meshes.grid(2, 2, "quad")
+    mesh = js.ControlMesh(10 * vertices, faces)
+    topology = js.build_topology(mesh, js.Interpolating(), 1)
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-2, 22, (300, 2)), rng.normal(scale=0.1, size=300)])
+    t = np.arange(-1, 21) + 0.5
+    low = np.full(len(t), -1.0)
+    sides = [(t, low), (t, low + 22), (low, t), (low + 22, t)]
+    square = np.concatenate([np.column_stack([*side, 0 * t]) for side in sides])
+    curves = [fitting.BoundaryCurve(square, 0.2), fitting.BoundaryCurve(square[::2], 0.2)]
+    options = {"free": fitting.Free(normals=False, h=False), "priors": PRIORS}
+    found = fitting.fit_cohort(
+        js.Interpolating(), topology, mesh.control(), [fitting.Scan(points)] * 2, boundary=curves, **options
+    )
+    for i, curve in enumerate(curves):
+        single = fitting.fit(
+            js.Interpolating(), topology, mesh.control(), fitting.Scan(points), boundary=curve, throw=False, **options
+        )
+        own, others = np.asarray(found.control.vertices[i]), np.asarray(single.control.vertices)
+        np.testing.assert_allclose(own[:, 2], others[:, 2], atol=0.01)
+        outside = np.abs(own[:, :2] - 10).max(axis=1) > 5  # on the boundary, along which control vertices slide
+        for rows in (own, others):
+            np.testing.assert_allclose(np.abs(rows[outside, :2] - 10).max(axis=1), 11, atol=0.05)
+
+
 def test_bad_scans_are_named(as_users_run):
     few = fitting.Scan(np.eye(3))
     with pytest.raises(fitting.ScanError, match=r"^scan 1: the scan has 3 points for 12"):

@@ -75,8 +75,9 @@ def fit_cohort(
         controls: where the fits start: one control for all, or one a scan, aligned with it (see `align`).
         scans: in mm. They may differ in length; all have normals, or none.
         free, loss, max_sweeps, tolerance: as in `fit`.
-        priors: as in `fit`; with `bend=None`, the default, the smoothness is that of the pilot, place by place; and
-            with `likeness=None` so is how much of each control mesh's own shape is expected of it.
+        priors: as in `fit`; strengths that `fit` would find from the scan are those of the pilot, place by place: with
+            `bend=None`, the default, the smoothness; with `likeness=None` how much of each control mesh's own shape is
+            expected of it; and how far shapes may be from their modes.
         pilot: an ordinary fit of the same control mesh; default, where it is needed: that of the first scan.
         landmarks, boundary: as in `fit`, one a scan; or one for all.
         landmark_deviation, symmetry: as in `fit`, for all; symmetry is by default that of the first control mesh.
@@ -112,9 +113,6 @@ def fit_cohort(
     partners = find_partners(symmetry, priors, topology, controls[0])
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
     settings["landmark_deviation"] = landmark_deviation
-    if priors.bend is None and pilot is None:
-        own = {"landmarks": places[0], "boundary": curves[0], "symmetry": partners}
-        pilot = fit(scheme, topology, controls[0], scans[0], throw=False, **settings, **own)
     inputs = []
     for control, scan, place, curve in zip(controls, scans, places, curves, strict=True):
         own = gather_inputs(scheme, topology, control, scan, free, place, landmark_deviation, curve)
@@ -123,6 +121,9 @@ def fit_cohort(
     made = [
         analyse(scheme, topology, control, free, priors, own) for control, own in zip(controls, inputs, strict=True)
     ]
+    if pilot is None and any(one.n_strengths and one.given_strengths() is None for one in made[0][0].priors):
+        own = {"landmarks": places[0], "boundary": curves[0], "symmetry": partners}
+        pilot = fit(scheme, topology, controls[0], scans[0], throw=False, **settings, **own)
     filled = [
         analyse(scheme, topology, control, free, priors, own)
         for control, own in zip(controls, _fill_up(inputs), strict=True)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 import jaxsubdiv as js
 
-from ..unknowns import Shared
+from ..unknowns import AnyArray, Shared
 
 
 def backend(*values: Any) -> Any:
@@ -104,15 +104,15 @@ class AbstractPrior(eqx.Module):
         """How many strengths, 1 / variances of its rows, the prior has that a fit finds or anneals."""
         return 0
 
-    def first_strengths(self) -> Float[np.ndarray, "s"]:
+    def first_strengths(self) -> Float[AnyArray, "s"]:
         """Those of the first sweep."""
         raise NotImplementedError
 
-    def given_strengths(self) -> Float[np.ndarray, "s"] | None:
+    def given_strengths(self) -> Float[AnyArray, "s"] | None:
         """Those that the settings ask for; None where they are found from the scan."""
         return None
 
-    def strength_rows(self) -> Int[np.ndarray, "m"]:
+    def strength_rows(self) -> Int[AnyArray, "m"]:
         """Which strength that of each row is; -1 for rows whose variance is known."""
         raise NotImplementedError
 
@@ -123,7 +123,7 @@ class AbstractFacePrior(AbstractPrior):
     needs_full_surface: ClassVar[bool] = False
     """Whether its rows look at vertices of the surface beyond those of the first level."""
 
-    def faces(self, held: Any) -> Int[np.ndarray, "m"]:
+    def faces(self, held: Any) -> Int[AnyArray, "m"]:
         """The control face of every row."""
         raise NotImplementedError
 
@@ -134,6 +134,6 @@ class AbstractVertexPrior(AbstractPrior):
     uses: ClassVar[tuple[str, ...]] = ()
     """Names of the shared unknowns that its rows depend on."""
 
-    def vertices(self) -> Int[np.ndarray, "m c"]:
+    def vertices(self) -> Int[AnyArray, "m c"]:
         """The control vertices of every row."""
         raise NotImplementedError

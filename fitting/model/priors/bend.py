@@ -51,10 +51,10 @@ class Bend(AbstractFacePrior):
     def n_strengths(self) -> int:
         return self.n_faces
 
-    def first_strengths(self) -> Float[np.ndarray, "f"]:
+    def first_strengths(self) -> Float[AnyArray, "f"]:
         return first_strengths(self.usual, self.n_faces)
 
-    def given_strengths(self) -> Float[np.ndarray, "f"] | None:
+    def given_strengths(self) -> Float[AnyArray, "f"] | None:
         if self.given is None:
             return None
         xp = backend(self.given)
@@ -65,7 +65,7 @@ class Bend(AbstractFacePrior):
         """Whether the likeness is found from the scan."""
         return self.likeness is None
 
-    def strength_rows(self) -> Int[np.ndarray, "b"]:
+    def strength_rows(self) -> Int[AnyArray, "b"]:
         return self.of_rows
 
     def hold(self, place: Place, strengths: dict[str, Any]) -> Float[Array, "b"]:
@@ -79,11 +79,11 @@ class Bend(AbstractFacePrior):
     def precisions(self, strengths: dict[str, Any]) -> Any:
         return strengths[self.name][self.of_rows]
 
-    def faces(self, held: Any) -> Int[np.ndarray, "b"]:
+    def faces(self, held: Any) -> Int[AnyArray, "b"]:
         return self.of_rows
 
 
-def first_strengths(usual: Float[Array | np.ndarray, ""], n_faces: int) -> Float[np.ndarray, "f"]:
+def first_strengths(usual: Float[Array | np.ndarray, ""], n_faces: int) -> Float[AnyArray, "f"]:
     """Stiffer than the template is; `usual` is the mean square of its rows."""
     xp = backend(usual)
     least = np.finfo(np.float64 if xp is np else usual.dtype).tiny

@@ -15,6 +15,7 @@ from jaxsubdiv.linalg import cross, dot, norm, take, unit
 
 from ...scan.closest_points import triangle_distance
 from ...scan.scan import ScanError
+from ..unknowns import AnyArray
 from .base import AbstractFacePrior, Place, Start
 
 _AT_ONCE = 256  # points that are held against all boundary edges together
@@ -132,7 +133,7 @@ class BoundaryPrior(AbstractFacePrior):
     def precisions(self, strengths: dict[str, Any]) -> Any:
         return self.counts.repeat(2)
 
-    def faces(self, held: Rim) -> Int[np.ndarray, "m"]:
+    def faces(self, held: Rim) -> Int[AnyArray, "m"]:
         return np.repeat(self.of_sides[np.asarray(held.side)], 2)
 
 

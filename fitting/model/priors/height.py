@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 import jaxsubdiv as js
 from jaxsubdiv.linalg import take
 
+from ..unknowns import AnyArray
 from .base import AbstractFacePrior, Place, Start, backend
 from .bend import compared_edges, expects_likeness, first_strengths, growth, project_edges, start_place
 
@@ -44,11 +45,11 @@ class Height(AbstractFacePrior):
     def n_strengths(self) -> int:
         return self.n_faces
 
-    def first_strengths(self) -> Float[np.ndarray, "f"]:
+    def first_strengths(self) -> Float[AnyArray, "f"]:
         xp = backend(self.template)
         return first_strengths(xp.asarray(xp.mean(self.template**2)), self.n_faces)
 
-    def strength_rows(self) -> Int[np.ndarray, "g"]:
+    def strength_rows(self) -> Int[AnyArray, "g"]:
         return self.of_rows
 
     def hold(self, place: Place, strengths: dict[str, Any]) -> Float[Array, "g"]:
@@ -61,7 +62,7 @@ class Height(AbstractFacePrior):
     def precisions(self, strengths: dict[str, Any]) -> Any:
         return strengths[self.name][self.of_rows]
 
-    def faces(self, held: Any) -> Int[np.ndarray, "g"]:
+    def faces(self, held: Any) -> Int[AnyArray, "g"]:
         return self.of_rows
 
 

@@ -10,6 +10,7 @@ import jaxsubdiv as js
 
 from ...scan.closest_points import closest_points
 from ...scan.landmarks import Landmarks, place_landmarks
+from ..unknowns import AnyArray
 from .base import AbstractFacePrior, Place, Start
 
 
@@ -49,7 +50,7 @@ class LandmarkPrior(AbstractFacePrior):
     def precisions(self, strengths: dict[str, Any]) -> Any:
         return 1.0
 
-    def faces(self, held: Any) -> Int[np.ndarray, "m"]:
+    def faces(self, held: Any) -> Int[AnyArray, "m"]:
         return np.repeat(self.of_landmarks, 3)
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxsubdiv.linalg import cross, dot, take, unit
 
+from ..unknowns import AnyArray
 from .base import AbstractFacePrior, Place, Start
 
 # A normal that leans less than this, as a cosine, from the faces around it keeps the surface smooth; it may be a little
@@ -45,6 +46,6 @@ class Margin(AbstractFacePrior):
     def precisions(self, strengths: dict[str, Any]) -> Any:
         return 1.0
 
-    def faces(self, held: Any) -> Int[np.ndarray, "m"]:
+    def faces(self, held: Any) -> Int[AnyArray, "m"]:
         quads = self.n_triangles + np.arange(self.n_quads)
         return np.concatenate([np.tile(np.arange(self.n_triangles), 3), np.tile(quads, 4)])

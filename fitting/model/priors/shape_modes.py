@@ -12,7 +12,7 @@ from jaxsubdiv.linalg import cross
 
 from ..modes import Modes
 from ..procrustes import align_shape
-from ..unknowns import Shared
+from ..unknowns import AnyArray, Shared
 from .base import AbstractVertexPrior, Place, Start, backend
 
 _FIRST = 0.1  # of a control edge: standard deviation of what the modes leave, in the first sweep
@@ -110,14 +110,14 @@ class ShapePrior(AbstractVertexPrior):
     def n_strengths(self) -> int:
         return 1
 
-    def first_strengths(self) -> Float[np.ndarray, "1"]:
+    def first_strengths(self) -> Float[AnyArray, "1"]:
         xp = backend(self.rest)
         return xp.full(1, xp.asarray(_FIRST * self.edge if self.rest is None else self.rest) ** -2.0)
 
-    def given_strengths(self) -> Float[np.ndarray, "1"] | None:
+    def given_strengths(self) -> Float[AnyArray, "1"] | None:
         return None if self.rest is None else self.first_strengths()
 
-    def strength_rows(self) -> Int[np.ndarray, "m"]:
+    def strength_rows(self) -> Int[AnyArray, "m"]:
         return np.append(np.zeros(self.mean.size, int), np.full(len(self.modes), -1))
 
     def shared(self) -> dict[str, Shared]:
@@ -152,6 +152,6 @@ class ShapePrior(AbstractVertexPrior):
         of_rest = xp.broadcast_to(xp.asarray(strengths[self.name])[0], (n,))
         return xp.concatenate([of_rest, xp.ones(k, of_rest.dtype)])
 
-    def vertices(self) -> Int[np.ndarray, "m 1"]:
+    def vertices(self) -> Int[AnyArray, "m 1"]:
         rows = np.append(np.repeat(np.arange(len(self.mean)), 3), np.full(len(self.modes), -1))
         return rows[:, None]

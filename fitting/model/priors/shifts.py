@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ...scan.scan import Scan
-from ..unknowns import Shared
+from ..unknowns import AnyArray, Shared
 from .base import AbstractVertexPrior, Place, Start
 
 _FEWEST = 10  # points of a slice that may move
@@ -53,7 +53,7 @@ class ShiftPrior(AbstractVertexPrior):
         slices = start.inputs.get("slices")
         if slices is None:
             return None
-        return cls(slices.numbers, slices.planes, np.minimum(np.asarray(priors.shift), _FARTHEST))
+        return cls(slices.numbers, slices.planes, np.asarray(min(float(priors.shift), _FARTHEST)))
 
     def shared(self) -> dict[str, Shared]:
         return {"shifts": Shared((len(self.numbers), 2)), "motion": Shared((3,), lasting=False, common=True)}
@@ -68,7 +68,7 @@ class ShiftPrior(AbstractVertexPrior):
     def precisions(self, strengths: dict[str, Any]) -> Any:
         return self.deviation**-2
 
-    def vertices(self) -> Int[np.ndarray, "m 0"]:
+    def vertices(self) -> Int[AnyArray, "m 0"]:
         return np.zeros((2 * len(self.numbers), 0), int)
 
 

@@ -10,6 +10,7 @@ import jaxsubdiv as js
 from jaxsubdiv.linalg import dot, norm, take, unit
 
 from ..procrustes import align_shape
+from ..unknowns import AnyArray
 from .base import AbstractFacePrior, Place, Start
 
 
@@ -54,5 +55,5 @@ class Stretch(AbstractFacePrior):
     def precisions(self, strengths: dict[str, Any]) -> Any:
         return self.deviation**-2
 
-    def faces(self, held: Any) -> Int[np.ndarray, "m"]:
+    def faces(self, held: Any) -> Int[AnyArray, "m"]:
         return np.repeat(self.of_edges, 3)

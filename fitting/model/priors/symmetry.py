@@ -186,7 +186,7 @@ class SymmetryPrior(AbstractVertexPrior):
     def precisions(self, strengths: dict[str, Any]) -> Any:
         return self.deviation**-2
 
-    def vertices(self) -> Int[np.ndarray, "m 2"]:
+    def vertices(self) -> Int[AnyArray, "m 2"]:
         pairs = np.repeat(np.stack([self.left, self.right], axis=1), 3, axis=0)
         alone = np.stack([self.on_plane, np.full(len(self.on_plane), -1)], axis=1)
         return np.concatenate([pairs, alone] * (2 if self.with_normals else 1))

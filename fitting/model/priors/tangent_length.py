@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..unknowns import Shared
+from ..unknowns import AnyArray, Shared
 from .base import AbstractVertexPrior, Place, Start
 
 
@@ -40,5 +40,5 @@ class TangentLength(AbstractVertexPrior):
     def precisions(self, strengths: dict[str, Any]) -> Any:
         return self.deviation**-2
 
-    def vertices(self) -> Int[np.ndarray, "n 0"]:
+    def vertices(self) -> Int[AnyArray, "n 0"]:
         return np.zeros((max(self.start.size, 1), 0), int)
