@@ -26,7 +26,8 @@ _ON_BOUNDARY = 1e-3  # how far, in parts of a face, a surface point may lie from
 _NEIGHBOURS = 9
 _CLEAN = 0.9  # of the points crowded: so few outliers that neighbours can be trusted
 _STEEPEST = 0.5  # height over length: by how much the anatomy may turn away beyond a boundary
-_ON_SURFACE = 1e-6  # in control edges: a point that is closer is on the surface, in no direction from it
+_ON_SURFACE = 1e-6  # in control edges: the same, where there is no noise and at open boundaries
+_NEAR = 3.0  # times the noise: distances of closer points count along the surface's normal
 _LEAST_COSINE = 0.5  # between a scan's normal and the surface's: beyond 60 degrees it is the other side of something
 
 
@@ -172,8 +173,12 @@ def measure(
     alike = jnp.ones((), points.dtype)
     if scene.strokes is not None:
         alike = scene.strokes.count_points_a_measurement(signed, weights)
-    # The derivative of a distance is along it: across the face, or from the edge or boundary that is closest.
-    directions = jnp.where(distance[:, None] > edge * _ON_SURFACE, unit(away), normals)
+    # The derivative of a distance is along it: across the face, or from the edge or boundary that is closest. But the
+    # direction to a point within the noise is itself noise, and in the end rounding, which would move control vertices
+    # along the surface, where little holds them; the surface's normal is none.
+    side = jnp.where(signed < 0, -1.0, 1.0)
+    near = jnp.maximum(jnp.where(at_boundary, 0.0, _NEAR * noise), edge * _ON_SURFACE)
+    directions = unit((side * near**2)[:, None] * normals + distance[:, None] * away)
     return Look(
         at=at,
         pairs=Pairs(points, corners, inside, directions),

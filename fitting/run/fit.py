@@ -189,7 +189,7 @@ def make_solver(
         linear_solver = "sparse" if jax.default_backend() == "cpu" else "conjugate gradients"
     if linear_solver == "sparse":
         held, _ = hold_priors(model, y, model.refine(y), first_strengths(model).values, scene)
-        solver = SparseNormal(find_structure(model, y, held, coarse=False))
+        solver = SparseNormal(find_structure(model, y, held))
     else:
         solver = ConjugateGradients(_TIGHT, _MOST_STEPS)
     tables = Folds(model.topology)
