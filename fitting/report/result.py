@@ -21,6 +21,7 @@ from .posterior import Posterior, Uncertainty
 from .record import Fit, look_at
 from .refit import Refit, make_refit
 from .report import Report, SliceShift, WorstPlace
+from .saved import save_fit
 
 
 @final
@@ -136,9 +137,7 @@ class FitResult:
             OSError: the folder cannot be made or written.
             ValueError: the scheme or the loss is of a class of your own, or the control mesh has creases.
         """
-        from .saved import save  # which makes results itself
-
-        save(folder, self)
+        save_fit(folder, self.fit, self.recipe)
 
     @property
     def points(self) -> Float[np.ndarray, "p 3"]:
