@@ -188,7 +188,9 @@ def measure(
 
 
 def on_boundary(
-    boundary: Bool[Array | np.ndarray, "v"], corners: Int[Array, "p 4"], corner_weights: Float[Array, "p 4"]
+    boundary: Bool[Array | np.ndarray, "v"],
+    corners: Int[Array | np.ndarray, "p 4"],
+    corner_weights: Float[Array | np.ndarray, "p 4"],
 ) -> Bool[Array, "p"]:
     """Which surface points lie on the boundary, of whose vertices `boundary` is true."""
     return jnp.sum(jnp.where(jnp.asarray(boundary)[corners], corner_weights, 0.0), axis=1) > 1 - _ON_BOUNDARY

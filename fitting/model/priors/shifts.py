@@ -53,7 +53,7 @@ class ShiftPrior(AbstractVertexPrior):
         slices = start.inputs.get("slices")
         if slices is None:
             return None
-        return cls(slices.numbers, slices.planes, np.minimum(np.asarray(priors.shift), _FARTHEST))
+        return cls(slices.numbers, slices.planes, np.asarray(np.minimum(priors.shift, _FARTHEST)))
 
     def shared(self) -> dict[str, Shared]:
         return {"shifts": Shared((len(self.numbers), 2)), "motion": Shared((3,), lasting=False, common=True)}
