@@ -104,11 +104,11 @@ class AbstractPrior(eqx.Module):
         """How many strengths, 1 / variances of its rows, the prior has that a fit finds or anneals."""
         return 0
 
-    def first_strengths(self) -> Float[np.ndarray, "s"]:
+    def first_strengths(self) -> Float[Array | np.ndarray, "s"]:
         """Those of the first sweep."""
         raise NotImplementedError
 
-    def given_strengths(self) -> Float[np.ndarray, "s"] | None:
+    def given_strengths(self) -> Float[Array | np.ndarray, "s"] | None:
         """Those that the settings ask for; None where they are found from the scan."""
         return None
 

@@ -51,10 +51,10 @@ class Bend(AbstractFacePrior):
     def n_strengths(self) -> int:
         return self.n_faces
 
-    def first_strengths(self) -> Float[np.ndarray, "f"]:
+    def first_strengths(self) -> Float[Array | np.ndarray, "f"]:
         return first_strengths(self.usual, self.n_faces)
 
-    def given_strengths(self) -> Float[np.ndarray, "f"] | None:
+    def given_strengths(self) -> Float[Array | np.ndarray, "f"] | None:
         if self.given is None:
             return None
         xp = backend(self.given)
@@ -83,7 +83,7 @@ class Bend(AbstractFacePrior):
         return self.of_rows
 
 
-def first_strengths(usual: Float[Array | np.ndarray, ""], n_faces: int) -> Float[np.ndarray, "f"]:
+def first_strengths(usual: Float[Array | np.ndarray, ""], n_faces: int) -> Float[Array | np.ndarray, "f"]:
     """Stiffer than the template is; `usual` is the mean square of its rows."""
     xp = backend(usual)
     least = np.finfo(np.float64 if xp is np else usual.dtype).tiny

@@ -44,7 +44,7 @@ class Height(AbstractFacePrior):
     def n_strengths(self) -> int:
         return self.n_faces
 
-    def first_strengths(self) -> Float[np.ndarray, "f"]:
+    def first_strengths(self) -> Float[Array | np.ndarray, "f"]:
         xp = backend(self.template)
         return first_strengths(xp.asarray(xp.mean(self.template**2)), self.n_faces)
 

@@ -110,11 +110,11 @@ class ShapePrior(AbstractVertexPrior):
     def n_strengths(self) -> int:
         return 1
 
-    def first_strengths(self) -> Float[np.ndarray, "1"]:
+    def first_strengths(self) -> Float[Array | np.ndarray, "1"]:
         xp = backend(self.rest)
         return xp.full(1, xp.asarray(_FIRST * self.edge if self.rest is None else self.rest) ** -2.0)
 
-    def given_strengths(self) -> Float[np.ndarray, "1"] | None:
+    def given_strengths(self) -> Float[Array | np.ndarray, "1"] | None:
         return None if self.rest is None else self.first_strengths()
 
     def strength_rows(self) -> Int[np.ndarray, "m"]:
