@@ -2,17 +2,21 @@
 
 import functools
 
+import equinox as eqx
 import jax.numpy as jnp
 import meshes
 import numpy as np
 import pytest
+from posteriors import precision_matrix
 from scans import assert_refit_knows_the_fit
 
 import fitting
 import jaxsubdiv as js
-from fitting import BoundaryCurve, Free, Scan, ScanError, _elements, boundary_of
-from fitting.model.priors.boundary import held_vertices, pair_with_boundary
-from fitting.scan.closest_points import nearest_on_segments
+from fitting import BoundaryCurve, Free, Priors, Scan, ScanError, boundary_of
+from fitting.model import pairing
+from fitting.model.priors import Place, Start
+from fitting.model.priors.boundary import BoundaryPrior, pair_with_boundary
+from fitting.solve import elements, sparse_normal, sweeps
 
 N_POINTS = 400
 
@@ -53,9 +57,34 @@ def fit(points: Scan, curve: BoundaryCurve | None) -> fitting.FitResult:
     return fitting.fit(js.Interpolating(), topology, mesh.control(), points, free=free, boundary=curve, throw=False)
 
 
+def place_of(surface: js.RefinedSurface, edge: float = 10.0) -> Place:
+    """Where the rows of a prior on the sheet are evaluated."""
+    mesh, topology = sheet()
+    control = mesh.control()
+    return Place(js.Interpolating(), topology, control, {}, surface, control.vertices, jnp.asarray(edge))
+
+
+def prior_of(curve: BoundaryCurve, surface: js.RefinedSurface) -> BoundaryPrior:
+    """The prior of a curve, on the sheet."""
+    mesh, topology = sheet()
+    scheme, control = js.Interpolating(), mesh.control()
+    owner = js.control_faces_of(scheme, topology, surface, control)
+    made = BoundaryPrior.make(
+        Priors(), Start(scheme, topology, control, surface, owner, False, False, {"boundary": curve})
+    )
+    assert made is not None
+    return made
+
+
+def flat() -> js.RefinedSurface:
+    mesh, topology = sheet()
+    return js.refine(js.Interpolating(), topology, mesh.control())
+
+
 def off(found: fitting.FitResult, curve: np.ndarray) -> float:
     """Root mean square distance of the curve's points from the boundary of the surface."""
-    away = np.asarray(pair_with_boundary(BoundaryCurve(curve, 1.0), found.surface).rows(found.surface.vertices))
+    prior, place = prior_of(BoundaryCurve(curve, 1.0), found.surface), place_of(found.surface)
+    away = np.asarray(prior.rows(place, prior.hold(place, {})))
     return float(np.sqrt(np.sum(away**2) / len(curve)))
 
 
@@ -71,17 +100,22 @@ def test_boundary_of_a_mesh_is_its_open_edges():
         boundary_of(js.ControlMesh(*meshes.cube()))
 
 
-def test_nearest_place_on_segments_is_that_of_a_search_through_all():
+def test_point_is_paired_with_the_place_that_a_search_through_all_finds():
     rng = np.random.default_rng(0)
     a, b, points = rng.normal(size=(70, 3)), rng.normal(size=(70, 3)), 2 * rng.normal(size=(300, 3))
     b[:5], b[5:9] = a[:5], a[5:9] + 40 * (b[5:9] - a[5:9])  # of no length, and long ones
-    which, along = nearest_on_segments(a, b, points)
-    found = np.linalg.norm(a[which] + along[:, None] * (b - a)[which] - points, axis=1)
+    rows, n = np.arange(70), len(points)
+    ends = np.stack([rows, rows + 70], axis=1)
+    vertices, up = jnp.asarray(np.concatenate([a, b])), jnp.asarray(np.tile((0.0, 0, 1), (140, 1)))
+    prior = BoundaryPrior(jnp.asarray(points), jnp.ones(n), jnp.array(1.0), ends, rows, np.arange(140))
+    found = pair_with_boundary(prior, js.RefinedSurface(vertices, up, {}), jnp.array(1.0))
+    which, along = np.asarray(found.side), np.asarray(found.along)
+    away = np.linalg.norm(a[which] + along[:, None] * (b - a)[which] - points, axis=1)
     squared = np.sum((b - a) ** 2, axis=1)
     best = np.clip(np.einsum("psk,sk->ps", points[:, None] - a, b - a) / np.maximum(squared, 1e-300), 0, 1)
-    away = np.linalg.norm(a + best[..., None] * (b - a) - points[:, None], axis=2)
+    expected = np.linalg.norm(a + best[..., None] * (b - a) - points[:, None], axis=2)
     assert ((along >= 0) & (along <= 1)).all()
-    np.testing.assert_allclose(found, away.min(axis=1), atol=1e-12)
+    np.testing.assert_allclose(away, expected.min(axis=1), atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -89,30 +123,44 @@ def test_nearest_place_on_segments_is_that_of_a_search_through_all():
     [((5, -3, 4), 5.0), ((5, 2, 0), 2.0), ((7, 0, 0), 0.0), ((-3, -4, 12), 13.0), ((20, 20, 0), 0.0)],
 )
 def test_rows_are_distances_across_the_boundary(point, distance):
-    mesh, topology = sheet()
-    surface = js.refine(js.Interpolating(), topology, mesh.control())
-    rim = pair_with_boundary(BoundaryCurve(np.array([point], float), 0.5), surface)
-    np.testing.assert_allclose(np.linalg.norm(rim.rows(surface.vertices)), distance / 0.5, atol=1e-9)
+    surface = flat()
+    prior, place = prior_of(BoundaryCurve(np.array([point], float), 0.5), surface), place_of(surface)
+    rim = prior.hold(place, {})
+    np.testing.assert_allclose(np.linalg.norm(prior.rows(place, rim)), distance / 0.5, atol=1e-9)
     directions = np.asarray(rim.directions)[0]
     np.testing.assert_allclose(directions @ directions.T, np.eye(2), atol=1e-9)
-    assert (np.asarray(surface.faces[4])[rim.face[0]][:, None] == np.asarray(rim.ends)[0]).any(axis=0).all()
+    ends = np.asarray(prior.ends)[np.asarray(rim.side)[0]]
+    beside = (np.asarray(surface.faces[4])[..., None] == ends).any(axis=1).all(axis=1)
+    owner = js.control_faces_of(place.scheme, place.topology, surface, place.control)
+    assert owner[beside].tolist() == prior.faces(rim)[:1].tolist() == prior.faces(rim)[1:].tolist()
 
 
 def test_boundary_slides_along_the_curve_but_not_across():
-    mesh, topology = sheet()
-    surface = js.refine(js.Interpolating(), topology, mesh.control())
-    rim = pair_with_boundary(BoundaryCurve(np.array([(7.0, -2.0, 1.0), (7.0, 0.0, 0.0)]), 1.0), surface)
-    rows = rim.rows(surface.vertices)
+    surface = flat()
+    prior = prior_of(BoundaryCurve(np.array([(7.0, -2.0, 1.0), (7.0, 0.0, 0.0)]), 1.0), surface)
+    rim = prior.hold(place_of(surface), {})
+    rows = prior.rows(place_of(surface), rim)
     for shift, change in (((3.0, 0, 0), 0.0), ((0, 3.0, 0), 3.0), ((0, 0, 3.0), 3.0)):
-        changed = np.reshape(rim.rows(surface.vertices + jnp.array([shift])) - rows, (2, 2))
+        moved = js.RefinedSurface(surface.vertices + jnp.array([shift]), surface.normals, surface.faces)
+        changed = np.reshape(prior.rows(place_of(moved), rim) - rows, (2, 2))
         np.testing.assert_allclose(np.linalg.norm(changed, axis=1), change, atol=1e-9)
 
 
 def test_curve_speaks_of_the_boundary_near_it():
-    mesh, topology = sheet()
-    surface = js.refine(js.Interpolating(), topology, mesh.control())
-    held = held_vertices(BoundaryCurve(np.array([(-1.0, y, 0) for y in range(21)]), 1.0), surface, edge=4.0)
+    surface = flat()
+    curve = BoundaryCurve(np.array([(-1.0, y, 0) for y in range(21)]), 1.0)
+    held = prior_of(curve, surface).hold(place_of(surface, edge=4.0), {}).covered
     np.testing.assert_array_equal(held, np.asarray(surface.vertices)[:, 0] < 1e-9)
+
+
+def test_points_that_fill_up_the_curve_say_nothing():
+    """As in a cohort, whose curves have different numbers of points."""
+    surface, curve = flat(), BoundaryCurve(np.array([(-1.0, y, 0) for y in range(21)]), 1.0)
+    prior, place = prior_of(curve, surface), place_of(surface, edge=4.0)
+    points, counts = jnp.pad(prior.points, ((0, 5), (0, 0))), jnp.pad(prior.counts, (0, 5))
+    filled = eqx.tree_at(lambda one: (one.points, one.counts), prior, (points, counts))
+    np.testing.assert_array_equal(filled.hold(place, {}).covered, prior.hold(place, {}).covered)
+    np.testing.assert_array_equal(filled.precisions({}), np.repeat([1.0, 0.0], [42, 10]))
 
 
 # Fits
@@ -145,13 +193,14 @@ def test_curve_along_a_part_leaves_the_rest_to_the_scan():
 
 def test_new_pairs_compile_nothing():
     fitted(-2.0, True)
-    before = _elements.differentiate._cached._cache_size()
+    programs = elements.differentiate, sparse_normal._evaluate, sweeps.hold_priors, sweeps._apply, pairing.measure
+    before = [program._cached._cache_size() for program in programs]
     fit(scan(1.0), BoundaryCurve(square(-0.5, 20.5), 0.3))
-    assert _elements.differentiate._cached._cache_size() == before
+    assert [program._cached._cache_size() for program in programs] == before
 
 
 def test_uncertainty_falls_where_the_curve_tells():
-    with_curve, without = (fitted(-2.0, given).posterior.matrix.toarray() for given in (True, False))
+    with_curve, without = (precision_matrix(fitted(-2.0, given)) for given in (True, False))
     spread = [np.sqrt(np.diag(np.linalg.inv(matrix))).reshape(9, 3)[:, :2] for matrix in (with_curve, without)]
     corner = 0
     assert (spread[0][corner] < 0.5 * spread[1][corner]).all()
@@ -161,7 +210,7 @@ def test_saved_fit_knows_its_curve(tmp_path):
     found = fitted(-2.0, True)
     found.save(tmp_path)
     again = fitting.load(tmp_path)
-    np.testing.assert_allclose(again.posterior.matrix.toarray(), found.posterior.matrix.toarray(), rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(precision_matrix(again), precision_matrix(found), rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(again.uncertainty().surface, found.uncertainty().surface, rtol=1e-9)
 
 

@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 
 import fitting
 import jaxsubdiv as js
-from fitting.model.pairing import Look, look, surroundings
+from fitting.model.pairing import Look, make_scene, measure
 from fitting.report.coverage import distances_to_scan, vertex_areas, weighted_quantile, worst_places
 from fitting.report.page import write_page
 
@@ -59,8 +59,9 @@ def sphere_of_quads(n: int):
 
 def seen_from(surface: js.RefinedSurface, points: np.ndarray) -> tuple[Look, np.ndarray]:
     """Pairs and signed distances, without a fit."""
-    scan, inside = fitting.Scan(points), np.zeros(len(surface.vertices), bool)
-    seen = look(surface, scan, inside, surroundings(scan), 8.0, fitting.Huber(), 1e-3)
+    scan = fitting.Scan(points)
+    at, lengths = fitting.closest_points(surface, scan.points), map(jnp.asarray, (8.0, 1e-3))
+    seen = measure(surface, make_scene(scan, surface), scan.points, at, *lengths, fitting.Huber())
     return seen, np.asarray(seen.distances)
 
 
@@ -185,7 +186,7 @@ def test_fewer_places_than_five_where_the_surface_is_small():
 def test_report_has_both_directions_the_unknowns_and_the_margin():
     result = noisy()
     report = result.report()
-    areas, away = vertex_areas(result.surface), distances_to_scan(result.surface, result._seen, result.inliers)
+    areas, away = vertex_areas(result.surface), distances_to_scan(result.surface, result.fit.look, result.inliers)
     here = ~np.isnan(away)
     there, share = np.abs(away[here]), areas[here] / areas[here].sum()
     np.testing.assert_allclose(report.coverage, areas[here].sum() / areas.sum(), rtol=1e-12)
@@ -315,7 +316,7 @@ def test_page_holds_the_surface_the_control_mesh_and_the_scan(folder):
         (data["start"], problem().start.vertices),
         (data["points"]["values"], result.distances[:, None]),
         (data["deviation"]["values"], result.uncertainty().surface[:, None]),
-        (data["distance"]["values"], distances_to_scan(surface, result._seen, result.inliers)[:, None]),
+        (data["distance"]["values"], distances_to_scan(surface, result.fit.look, result.inliers)[:, None]),
     ):
         np.testing.assert_array_equal(array(text, "<f4", values.shape[1]), np.asarray(values, np.float32))
     np.testing.assert_array_equal(array(data["surface"]["triangles"], "<u4", 3), surface.triangles())

@@ -1,5 +1,6 @@
 """A fit as a folder, and back."""
 
+import json
 import os
 import zipfile
 from pathlib import Path
@@ -10,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float
 
 import jaxsubdiv as js
 from jaxsubdiv.files import replacing
@@ -18,10 +19,10 @@ from jaxsubdiv.files import replacing
 from ..model.pairing import Look, make_scene
 from ..model.priors.boundary import BoundaryCurve
 from ..model.priors.landmarks import Anchors
-from ..model.priors.shifts import find_slice_planes
+from ..model.priors.shifts import SlicePlanes, find_slice_planes
 from ..model.priors.symmetry import symmetry_of
 from ..model.recipe import Settings
-from ..model.residual import Pairs, analyse
+from ..model.residual import Model, Pairs, analyse
 from ..model.unknowns import Variables
 from ..scan.scan import Scan
 from ..solve.strengths import Strengths
@@ -98,7 +99,9 @@ def load_fit(folder: str | os.PathLike[str]) -> tuple[Fit, str]:
         raise FileNotFoundError(f"{folder} has no {_FIT}: it is not the folder of a fit that was saved.")
     try:
         arrays = _read(path)
-        return _restore(arrays), str(arrays["recipe"])
+        recipe = str(arrays["recipe"])
+        Settings.from_json(recipe)  # what is wrong with it is told with the file
+        return _restore(arrays), recipe
     except KeyError as error:
         raise ValueError(f"{path}: {error.args[0]!r} is missing: the file is not one of a saved fit.") from None
     except (ValueError, TypeError, IndexError, EOFError, zipfile.BadZipFile) as error:
@@ -120,17 +123,48 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 
 
 def _update(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The arrays of version 3 as those of version 4."""
+    """The arrays of version 3 as those of version 4, but for shifts, and for which faces' shape was expected."""
     arrays = dict(arrays)
     precision, n_faces = arrays.pop("bend_precision"), len(arrays["triangles"]) + len(arrays["quads"])
-    arrays |= {"settings": arrays["recipe"], "strength_bend": precision[:n_faces]}
+    arrays["strength_bend"] = precision[:n_faces]
     arrays["strength_likeness"] = arrays.pop("likeness")
+    # The recipe was that of the whole fit of a scan, which fits a mesh made from the scan or split in its own way.
+    settings = json.loads(str(arrays["recipe"]))
+    priors = settings.setdefault("priors", {})
     if len(arrays["expected_rows"]):
         arrays["strength_height"] = precision[n_faces:]
+    if not len(arrays["expected_rows"]) and not np.any(arrays["expected_bends"]):
+        priors["likeness"] = 0.0
+    elif priors.get("likeness") == 0:
+        priors["likeness"] = 1.0
     if "h" in arrays:
         arrays["shared_h"] = arrays.pop("h")
+        if np.shape(settings["scheme"].get("h", 1.0)) != arrays["shared_h"].shape:
+            settings["scheme"]["h"] = arrays["shared_h"].tolist()
+    arrays["settings"] = np.asarray(json.dumps(settings))
     arrays["shifting"] = np.asarray("shifts" in arrays)
     return arrays
+
+
+def _expected_faces(arrays: dict[str, np.ndarray], model: Model) -> Bool[np.ndarray, "f"] | None:
+    """The control faces whose shape a fit of version 3 expected; None where it was that of all, or of none."""
+    bend: Any = model.prior("bend")
+    if not np.any(np.asarray(bend.template)):
+        return None
+    told = arrays["expected_bends"] != 0
+    told[arrays["expected_rows"]] = True
+    n = model.topology.n_control_faces
+    alike = (np.bincount(bend.of_rows, told, n) > 0) | (np.bincount(bend.of_rows, minlength=n) == 0)
+    return None if alike.all() else alike
+
+
+def _shifts_within(arrays: dict[str, np.ndarray], planes: SlicePlanes) -> Float[np.ndarray, "s 2"]:
+    """The shifts of version 3, which are vectors, along the axes of their slices' planes."""
+    if "shifts" not in arrays:
+        return np.zeros((len(planes.numbers), 2))
+    if not np.array_equal(planes.numbers, arrays["slices"]):
+        raise ValueError("'slices' are not those of the scan that may move.")
+    return np.einsum("sx,sjx->sj", arrays["shifts"], planes.planes)
 
 
 def _restore(arrays: dict[str, np.ndarray]) -> Fit:
@@ -153,20 +187,15 @@ def _restore(arrays: dict[str, np.ndarray]) -> Fit:
         inputs["boundary"] = BoundaryCurve(arrays["boundary_points"], float(arrays["boundary_deviation"]))
     if settings.free.shifts:
         inputs["slices"] = find_slice_planes(scan)
-    model, first = analyse(scheme, topology, start, settings.free, settings.priors, inputs)
-    shared = {
-        name: on_device(f"shared_{name}") if f"shared_{name}" in arrays else value
-        for name, value in first.shared.items()
-    }
+    of_fit = scheme, topology, start, settings.free, settings.priors
+    model, first = analyse(*of_fit, inputs)
+    if int(arrays["version"]) == 3 and (alike := _expected_faces(arrays, model)) is not None:
+        inputs["alike"] = alike
+        model, first = analyse(*of_fit, inputs)
+    if int(arrays["version"]) == 3 and "shifts" in first.shared:
+        arrays["shared_shifts"] = _shifts_within(arrays, inputs["slices"])
+    shared = {name: on_device(f"shared_{name}") for name in first.shared}
     y = Variables(js.Control(on_device("control_vertices"), on_device("control_normals")), shared)
-    if "h" not in y.shared and scheme.h is not None and "shared_h" in arrays:
-        model = eqx.tree_at(lambda one: one.scheme.h, model, on_device("shared_h"))
-    if "shifts" in arrays:  # of version 3, as vectors
-        planes = inputs.get("slices")
-        if planes is None or not np.array_equal(planes.numbers, arrays["slices"]):
-            raise ValueError("'slices' are not those of the scan that may move.")
-        within = np.einsum("sx,sjx->sj", arrays["shifts"], planes.planes)
-        y.shared["shifts"] = jnp.asarray(within)
     surface = model.refine(y)
     face = arrays["face"]
     if not ((face >= 0) & (face < surface.n_faces)).all():

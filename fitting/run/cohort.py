@@ -106,7 +106,7 @@ def fit_cohort(
     sound = {}
     for control in controls:  # mostly the same one for all
         if id(control) not in sound:
-            sound[id(control)] = sound_start(scheme, topology, control, free)
+            sound[id(control)] = sound_start(scheme, topology, control, free, stacklevel=3)
     controls = [sound[id(control)] for control in controls]
     places = [None] * n if landmarks is None else _one_each(landmarks, Landmarks, n, "landmarks")
     curves = [None] * n if boundary is None else _one_each(boundary, BoundaryCurve, n, "boundaries")

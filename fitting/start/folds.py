@@ -125,8 +125,11 @@ class Folds(eqx.Module):
         return best if np.sum(self.upside_down(best)) < np.sum(turned) else vertices
 
 
-def unfolded_start(topology: js.Topology, control: js.Control, may_move: Bool[np.ndarray, "v"] | bool) -> js.Control:
-    """The control mesh without faces upside down, as far as vertices that are free can mend it; it warns of them."""
+def unfolded_start(
+    topology: js.Topology, control: js.Control, may_move: Bool[np.ndarray, "v"] | bool, stacklevel: int = 2
+) -> js.Control:
+    """The control mesh without faces upside down, as far as vertices that are free can mend it; it warns of them, at
+    the line that is so many calls away."""
     folds, given = Folds(topology), np.asarray(control.vertices, np.float64)
     turned = folds.upside_down(given)
     if not turned.any():
@@ -143,6 +146,6 @@ def unfolded_start(topology: js.Topology, control: js.Control, may_move: Bool[np
         "faces of the control mesh that lie upside down on those beside them where the fit starts: "
         f"{name_rows(np.flatnonzero(turned))} ({np.sum(turned)} of {len(turned)}, triangles counted before quads). "
         f"{done} Mend them in the control mesh, or make it again.",
-        stacklevel=4,
+        stacklevel=stacklevel,
     )
     return control if unmended else js.Control(jnp.asarray(mended, control.vertices.dtype), control.normals)

@@ -22,24 +22,29 @@ from typing import Any
 from unittest.mock import patch
 
 PARTS = {
-    "closest points": ["fitting.model.pairing.closest_points"],
-    "weights, noise": ["fitting.model.pairing.measure"],
-    "derivatives": ["fitting.solve.problem.differentiate", "fitting.solve.problem.differentiate_distances"],
-    "normal equations": [
-        "fitting.solve.problem.equations_of_many",
-        "fitting.solve.problem.normal_matrix",
-        "fitting.solve.problem.times_transposed",
+    "closest points": ["fitting.solve.sweeps.closest_points"],
+    "weights, noise": ["fitting.solve.sweeps.measure"],
+    "what priors hold": ["fitting.solve.sweeps.hold_priors", "fitting.solve.sweeps.hold_sweep"],
+    "rows and gradient": ["fitting.solve.sparse_normal._evaluate"],
+    "derivatives": [
+        "fitting.solve.sparse_normal.differentiate",
+        "fitting.solve.sparse_normal._differentiate_tied",
     ],
-    "factorisation": ["fitting.solve.problem.factorise"],
-    "smoothness by the evidence": ["fitting.solve.problem.next_precision", "fitting.solve.problem.jacobian"],
-    "degrees of freedom": ["fitting.solve.problem.Problem._count_determined"],
-    "new surface": ["fitting.run.fit._apply", "jaxsubdiv.refine", "fitting.run.fit.surface_moved"],
+    "normal equations": ["fitting.solve.sweeps.SparseNormal.linearise"],
+    "factorisation": ["fitting.solve.sparse_normal.SparseEquations.factorise"],
+    "solution": ["fitting.solve.sparse_normal.ArrowheadFactor.solve"],
+    "strengths by the evidence": ["fitting.solve.sweeps.FromScan.update"],
+    "degrees of freedom": ["fitting.solve.sweeps.count_determined"],
+    "faces upside down": ["fitting.solve.sweeps.Sweeps._turned_over"],
+    "new surface": ["fitting.solve.sweeps._apply", "fitting.solve.sweeps._refine"],
     "analysis, once a fit": [
-        "fitting.solve.problem.Problem._analyse",
-        "fitting.solve.problem.Problem.__init__",
-        "fitting.model.view.surroundings",
+        "fitting.run.fit.analyse",
+        "fitting.run.fit.make_scene",
+        "fitting.run.fit.find_structure",
+        "fitting.run.fit.Folds",
+        "fitting.run.fit.sound_start",
     ],
-    "step and solution": ["fitting.solve.problem.Problem.step"],
+    "rest of a sweep": ["fitting.solve.sweeps.Sweeps.step"],
 }
 STAGES = {"jaxpr_trace": "traced", "jaxpr_to_mlir_module": "lowered", "backend_compile": "compiled"}
 
