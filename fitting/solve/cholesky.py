@@ -390,8 +390,8 @@ def _fronts(
         coupled = np.unique(_joined([graph[part].indices] + [rows[child] for child in children[number]]))
         rows.append(coupled[front_of[coupled] > number])
         for child in sorted(children[number], key=lambda c: -weight[rows[c]].sum()):
-            k, r = weight[parts[child]].sum(), weight[rows[child]].sum()
-            own, above = weight[parts[number]].sum(), weight[rows[number]].sum()
+            k, r = int(weight[parts[child]].sum()), int(weight[rows[child]].sum())
+            own, above = int(weight[parts[number]].sum()), int(weight[rows[number]].sum())
             if _work(k + own, above) < _work(k, r) + _work(own, above) + MERGE:
                 children[number] = [c for c in children[number] if c != child] + children[child]
                 parts[number], parts[child] = np.append(parts[child], parts[number]), parts[child][:0]
