@@ -154,14 +154,18 @@ def _restore(arrays: dict[str, np.ndarray]) -> Fit:
     if settings.free.shifts:
         inputs["slices"] = find_slice_planes(scan)
     model, first = analyse(scheme, topology, start, settings.free, settings.priors, inputs)
-    shared = {
-        name: on_device(f"shared_{name}") if f"shared_{name}" in arrays else value
-        for name, value in first.shared.items()
-    }
+    shared = dict(first.shared)
+    for name, value in first.shared.items():
+        key = f"shared_{name}"
+        if key not in arrays and name == "shifts":  # of version 3, as vectors
+            continue
+        shared[name] = on_device(key)
+        if shared[name].shape != value.shape:
+            raise ValueError(f"{key!r} has the shape {list(shared[name].shape)} and not {list(value.shape)}.")
     y = Variables(js.Control(on_device("control_vertices"), on_device("control_normals")), shared)
     if "h" not in y.shared and scheme.h is not None and "shared_h" in arrays:
         model = eqx.tree_at(lambda one: one.scheme.h, model, on_device("shared_h"))
-    if "shifts" in arrays:  # of version 3, as vectors
+    if "shifts" in arrays:
         planes = inputs.get("slices")
         if planes is None or not np.array_equal(planes.numbers, arrays["slices"]):
             raise ValueError("'slices' are not those of the scan that may move.")
