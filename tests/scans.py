@@ -9,6 +9,10 @@ import numpy as np
 
 import fitting
 import jaxsubdiv as js
+from fitting import Free, Priors
+from fitting.model.residual import Held, Model, Pairs, analyse
+from fitting.model.unknowns import Variables
+from fitting.solve.strengths import first_strengths
 
 N_POINTS = 600
 SIGMA = 0.3  # mm: the noise of a noisy scan
@@ -50,9 +54,30 @@ def noise(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).normal(scale=SIGMA, size=(N_POINTS, 3))
 
 
+def analysed(
+    scheme: js.AbstractScheme,
+    topology: js.Topology,
+    control: js.Control,
+    *,
+    free: Free | None = None,
+    priors: Priors | None = None,
+    **inputs,
+) -> tuple[Model, Variables]:
+    """The model of a fit that starts here, and its variables there."""
+    return analyse(scheme, topology, control, free or Free(), priors or Priors(), inputs)
+
+
+def hold_everything(model: Model, y: Variables, pairs: Pairs, faces: np.ndarray) -> Held:
+    """What a first sweep from here would hold, with pairs of weight 1."""
+    strengths = first_strengths(model).values
+    precisions = {prior.name: prior.precisions(strengths) for prior in model.priors}
+    held = model.hold(model.place(y, model.refine(y)), strengths)
+    return Held(pairs, faces, None, None, np.ones(len(faces)), held, precisions)
+
+
 def assert_refit_knows_the_fit(result: fitting.FitResult) -> None:
     """Its cost has the slope that the equations of the fit's sweeps have: nothing that they know is left out."""
-    of, fixed = result.posterior, result.refit()._fixed
-    gradient = of.problem._equations(of.scheme, of.control, of.seen, of.shifts).gradient
+    fixed = result.refit()._fixed
+    gradient = result.fit.equations().gradient
     expected, size = np.asarray(fixed.whitening).T @ gradient, float(np.linalg.norm(fixed.left))
     np.testing.assert_allclose(fixed.left, expected, rtol=1e-3, atol=1e-3 * size)

@@ -12,24 +12,18 @@ import meshio
 import numpy as np
 import optimistix as optx
 import pytest
-from scans import N_POINTS, SIGMA, noise, problem
+from scans import N_POINTS, SIGMA, analysed, hold_everything, noise, problem
 from schemes import control_mesh, inherited
 
 import fitting
 import jaxsubdiv as js
-from fitting import Free, Priors, Scan, ScanError, _fit
+from fitting import Free, Priors, Residual, Scan, ScanError
 from fitting.__main__ import main as fitting_command
-from fitting.model.residual import (
-    Pairs,
-    Start,
-    bend_asymmetry,
-    bend_edges,
-    control_edges,
-    control_faces_of,
-    residuals,
-)
-from fitting.model.unknowns import apply_offset, no_offset, tangents
+from fitting.model.priors.bend import bend_asymmetry
+from fitting.model.residual import Model, Pairs
+from fitting.model.unknowns import Unknowns, Variables, tangents
 from fitting.solve.elements import differentiate
+from fitting.solve.sparse_normal import SparseEquations
 
 LOOSE = Priors(bend=10.0, stretch=10.0, h=10.0)
 """Priors that leave everything to the scan; where it says nothing they still hold the fit together."""
@@ -57,7 +51,13 @@ def on_shape(shape: str, levels: int = 2) -> tuple[js.RefinedSurface, np.ndarray
         "ellipsoid": (ball * (3, 2, 1), ball / (3, 2, 1) / np.linalg.norm(ball / (3, 2, 1), axis=1, keepdims=True)),
     }[shape]
     surface = js.RefinedSurface(jnp.asarray(vertices), jnp.asarray(normals), topology.faces)
-    return surface, np.asarray(bend_edges(js.Interpolating(), topology))
+    return surface, compared(topology)
+
+
+def compared(topology: js.Topology) -> np.ndarray:
+    """The edges whose bends a fit compares."""
+    control = js.Control(*np.random.default_rng(0).normal(size=(2, topology.n_control_vertices, 3)))
+    return np.asarray(analysed(js.Interpolating(), topology, control)[0].prior("bend").edges)
 
 
 @pytest.mark.parametrize("shape", ["plane", "cylinder", "sphere", "inside of a sphere"])
@@ -84,11 +84,11 @@ def test_bend_asymmetry_sees_a_normal_that_leans():
     assert np.abs(found[at_leaning]).max() > 0.05
 
 
-@pytest.mark.parametrize(("levels", "compared"), [(1, 0), (2, 1), (3, 1)])
-def test_bend_asymmetry_is_taken_over_the_first_level_or_the_control_edges(levels, compared):
+@pytest.mark.parametrize(("levels", "at"), [(1, 0), (2, 1), (3, 1)])
+def test_bend_asymmetry_is_taken_over_the_first_level_or_the_control_edges(levels, at):
     topology = js.build_topology(control_mesh(meshes.grid(3, 2, "mixed")), js.Interpolating(), levels)
-    found, level = bend_edges(js.Interpolating(), topology), topology.levels[compared]
-    assert {frozenset(edge) for edge in np.asarray(found).tolist()} == {
+    found, level = compared(topology), topology.levels[at]
+    assert {frozenset(edge) for edge in found.tolist()} == {
         frozenset(edge) for edge in np.asarray(level.edges).tolist()
     }
 
@@ -104,7 +104,7 @@ def test_faces_of_a_dual_scheme_belong_to_the_nearest_control_face():
         for vertices, faces in ((mesh.vertices, mesh.faces), (surface.vertices, surface.faces))
     )
     apart = np.linalg.norm(of_surface[:, None] - of_faces, axis=2)
-    owner = control_faces_of(scheme, topology, surface, mesh.control())
+    owner = js.control_faces_of(scheme, topology, surface, mesh.control())
     np.testing.assert_allclose(apart[np.arange(len(owner)), owner], apart.min(axis=1), rtol=1e-6)
 
 
@@ -128,46 +128,46 @@ def two_points() -> Pairs:
     )
 
 
-def start_of(scheme, topology, control, template=None) -> Start:
-    template = control.vertices if template is None else jnp.asarray(template)
-    return Start(scheme, topology, control, template, None, control_edges(topology), bend_edges(scheme, topology))
+def rows_of(h: float, lean: float, pairs: Pairs, template=None) -> dict[str, np.ndarray]:
+    """The rows on the leaning triangle, of a sweep that starts from the template with h = 1."""
+    scheme, topology, control = one_triangle(h, lean)
+    start = control if template is None else js.Control(jnp.asarray(template), control.normals)
+    model, y = analysed(js.Interpolating(1.0), topology, start, priors=Priors(bend=1.0))
+    held = hold_everything(model, y, pairs, np.zeros(2, int))
+    return Residual(model).rows(Variables(control, {"h": scheme.h}), held)
 
 
-def test_residuals_are_those_worked_out_by_hand():
-    start = start_of(*one_triangle(h=1.5, lean=0.2), template=[(0.0, 0, 0), (2, 0, 0), (0, 4, 1)])
-    rows = residuals(no_offset(Free(), start.scheme, start.control), start, two_points())
-    np.testing.assert_allclose(rows.distance, [-5, -0.5], rtol=1e-12)
+def test_rows_are_those_worked_out_by_hand():
+    rows = rows_of(1.5, 0.2, two_points(), template=[(0.0, 0, 0), (2, 0, 0), (0, 4, 1)])
+    np.testing.assert_allclose(rows["distance"], [-5, -0.5], rtol=1e-12)
     # Only the side of 3 leaves the first corner along the lean: 3 sin(lean) / 2.
-    np.testing.assert_allclose(np.sort(np.abs(rows.bend)), [0, 0, 1.5 * np.sin(0.2)], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(np.sort(np.abs(rows["bend"])), [0, 0, 1.5 * np.sin(0.2)], rtol=1e-12, atol=1e-12)
     # The side of 3 was 2 long; the others were off in z alone, which is nearly across.
-    stretch = np.linalg.norm(np.reshape(rows.stretch, (3, 3)), axis=1)
+    stretch = np.linalg.norm(np.reshape(rows["stretch"], (3, 3)), axis=1)
     of_three = np.argmax(stretch)
     np.testing.assert_allclose(stretch[of_three], 0.5 * np.cos(0.1), rtol=1e-12)
     np.testing.assert_array_less(np.delete(stretch, of_three), 0.27)
     expected = np.log1p(np.exp((0.2 - np.array([np.cos(0.2), 1, 1])) / 0.1)) * 0.1 / 0.02
-    np.testing.assert_allclose(rows.margin, expected, rtol=1e-12)
-    np.testing.assert_allclose(rows.h, [0.5], rtol=1e-12)
-    assert rows.landmark.shape == (0,)
+    np.testing.assert_allclose(rows["margin"], expected, rtol=1e-12)
+    np.testing.assert_allclose(rows["h"], [0.5], rtol=1e-12)
+    assert set(rows) == {"distance", "bend", "stretch", "margin", "h"}
 
 
 def test_margin_grows_as_a_normal_leans_over():
-    zero, pairs = None, two_points()
-    margins = []
-    for lean in (0.0, 1.0, 1.4, 1.7):
-        start = start_of(*one_triangle(h=1.0, lean=lean))
-        zero = no_offset(Free(), start.scheme, start.control)
-        margins.append(float(residuals(zero, start, pairs).margin[0]))
+    margins = [float(rows_of(1.0, lean, two_points())["margin"][0]) for lean in (0.0, 1.0, 1.4, 1.7)]
     assert margins[0] < 0.01 and np.all(np.diff(margins) > 0) and margins[-1] > 10
 
 
-def test_residuals_have_finite_derivatives_at_a_perfect_fit():
-    start = start_of(*one_triangle(h=1.0, lean=0.0))
+def test_rows_have_finite_derivatives_at_a_perfect_fit():
+    scheme, topology, control = one_triangle(h=1.0, lean=0.0)
+    model, y = analysed(scheme, topology, control)
     pairs = two_points()._replace(points=jnp.array([(0.75, 1.0, 0.0), (3.0, 0.0, 0.0)]))
-    zero = no_offset(Free(), start.scheme, start.control)
-    rows = jax.jacfwd(lambda y: residuals(y, start, pairs))(zero)
-    assert np.allclose(residuals(zero, start, pairs).distance, 0)
-    assert all(np.isfinite(part).all() for part in jax.tree.leaves(rows))
-    assert np.any(rows.distance.vertices) and np.any(rows.bend.normals)
+    held = hold_everything(model, y, pairs, np.zeros(2, int))
+    of_offsets = Residual(model).about(y)
+    by = jax.jacfwd(of_offsets)(of_offsets.zero, held)
+    assert np.allclose(Residual(model).rows(y, held)["distance"], 0)
+    assert all(np.isfinite(part).all() for part in jax.tree.leaves(by))
+    assert np.any(by["distance"].vertices) and np.any(by["bend"].normals)
 
 
 # Unknowns
@@ -182,32 +182,40 @@ def test_tangents_are_orthonormal_and_turn_to_the_normal():
     np.testing.assert_allclose(np.linalg.det(frames), 1, atol=1e-14)
 
 
+def started(h=1.0, free: Free | None = None) -> tuple[Model, Variables]:
+    p = problem()
+    unit = js.Control(p.start.vertices, p.start.normals / np.linalg.norm(p.start.normals, axis=1, keepdims=True))
+    levels = np.size(h)
+    topology = p.topology if levels == 1 else js.build_topology(p.mesh, js.Interpolating(), levels)
+    return analysed(js.Interpolating(h), topology, unit, free=free)
+
+
+def offset_of(model: Model, values) -> Unknowns:
+    """Offsets of all unknowns, from a value or one for each."""
+    return model.layout.split(jnp.broadcast_to(jnp.asarray(values, float), (model.layout.n,)))
+
+
 @pytest.mark.parametrize("h", [1.2, [1.2, 0.7]])
 def test_offset_of_zero_changes_nothing(h):
-    p, scheme = problem(), js.Interpolating(h)
-    unit = js.Control(p.start.vertices, p.start.normals / np.linalg.norm(p.start.normals, axis=1, keepdims=True))
-    found, control = apply_offset(p.topology, scheme, unit, no_offset(Free(), scheme, unit))
-    np.testing.assert_array_equal(control.vertices, unit.vertices)
-    np.testing.assert_allclose(control.normals, unit.normals, rtol=0, atol=4e-16)
-    np.testing.assert_array_equal(found.h, scheme.h)
+    model, y = started(h)
+    found = model.retract(y, offset_of(model, 0))
+    np.testing.assert_array_equal(found.control.vertices, y.control.vertices)
+    np.testing.assert_allclose(found.control.normals, y.control.normals, rtol=0, atol=4e-16)
+    np.testing.assert_array_equal(found.shared["h"], y.shared["h"])
+    np.testing.assert_array_equal(model.scheme_at(found).h, h)
 
 
 @pytest.mark.parametrize("size", [0.01, 1, 1e6])
 def test_offset_leaves_normals_unit(size):
-    p, scheme = problem(), js.Interpolating()
-    rng = np.random.default_rng(0)
-    offset = jax.tree.map(lambda x: jnp.asarray(size * rng.normal(size=x.shape)), no_offset(Free(), scheme, p.start))
-    _, control = apply_offset(p.topology, scheme, p.start, offset)
-    np.testing.assert_allclose(np.linalg.norm(control.normals, axis=1), 1, atol=1e-14)
+    model, y = started()
+    offset = offset_of(model, size * np.random.default_rng(0).normal(size=model.layout.n))
+    np.testing.assert_allclose(np.linalg.norm(model.retract(y, offset).control.normals, axis=1), 1, atol=1e-14)
 
 
 @pytest.mark.parametrize("free", [Free(True, False, False), Free(False, True, False), Free(False, False, True)])
 def test_offset_of_one_moves_the_surface_by_about_a_millimetre(free):
-    p, scheme, small = problem(), js.Interpolating(), 1e-3
-    offset = jax.tree.map(lambda x: jnp.full_like(x, small), no_offset(free, scheme, p.start))
-    moved_scheme, moved_control = apply_offset(p.topology, scheme, p.start, offset)
-    before = js.refine(scheme, p.topology, p.start)
-    after = js.refine(moved_scheme, p.topology, moved_control)
+    (model, y), small = started(free=free), 1e-3
+    before, after = (model.refine(model.retract(y, offset_of(model, size))) for size in (0, small))
     moved = np.linalg.norm(after.vertices - before.vertices, axis=1) / small
     assert 0.3 < moved.max() < 3
 
@@ -369,17 +377,16 @@ def test_too_few_sweeps_are_a_result_where_nothing_is_thrown(max_sweeps):
 
 def broken_from(sweep: int, monkeypatch: pytest.MonkeyPatch, value: float) -> None:
     """Let a sweep and those after it find a value that is not finite."""
-    sound, calls = _fit.Problem.step, []
+    sound, calls = SparseEquations.step, []
 
-    def broken(self, *start):
+    def broken(self, damping, active):
         calls.append(1)
-        step = sound(self, *start)
-        if len(calls) < sweep:
-            return step
-        offset, shifts = step
-        return dataclasses.replace(offset, vertices=offset.vertices.at[3, 1].set(value)), shifts
+        step = sound(self, damping, active)
+        if len(calls) >= sweep:
+            step[self.model.layout.width * 3 + 1] = value
+        return step
 
-    monkeypatch.setattr(_fit.Problem, "step", broken)
+    monkeypatch.setattr(SparseEquations, "step", broken)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

@@ -1,5 +1,6 @@
 """What a fit makes small: the distances to the scan, and the rows of its priors."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -51,6 +52,10 @@ class Model(eqx.Module):
     def prior(self, name: str) -> AbstractPrior | None:
         """The prior of a name, where it is in force."""
         return next((prior for prior in self.priors if prior.name == name), None)
+
+    def bare(self) -> "Model":
+        """The model without what its rows do not depend on."""
+        return dataclasses.replace(self, priors=tuple(prior.bare() for prior in self.priors))
 
     @property
     def face_priors(self) -> list[AbstractFacePrior]:

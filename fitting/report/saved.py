@@ -195,6 +195,9 @@ def _restore(arrays: dict[str, np.ndarray]) -> Fit:
     if int(arrays["version"]) == 3 and "shifts" in first.shared:
         arrays["shared_shifts"] = _shifts_within(arrays, inputs["slices"])
     shared = {name: on_device(f"shared_{name}") for name in first.shared}
+    for name, value in shared.items():
+        if value.shape != (usual := first.shared[name]).shape:
+            raise ValueError(f"'shared_{name}' has the shape {list(value.shape)} and not {list(usual.shape)}.")
     y = Variables(js.Control(on_device("control_vertices"), on_device("control_normals")), shared)
     surface = model.refine(y)
     face = arrays["face"]

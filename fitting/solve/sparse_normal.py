@@ -166,8 +166,9 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any], *, coarse: 
     Raises:
         ValueError: a face of the scheme depends on too many control vertices.
     """
-    coarser = coarsen(model) if coarse else None
-    full, model = model, model if coarser is None else coarser.model
+    full = model.bare()
+    coarser = coarsen(full) if coarse else None
+    model = full if coarser is None else coarser.model
     surface = model.refine(y)
     owner = js.control_faces_of(model.scheme, model.topology, surface, y.control)
     patches = find_patches(surface, owner, model.topology.n_control_faces)
@@ -274,8 +275,9 @@ class SparseEquations:
 
     def __init__(self, structure: Structure, model: Model, y: Variables, held: Held):
         self.structure, self.model, self.y, self.held = structure, model, y, held
-        self._matrix_model = model if structure.coarse is None else structure.coarse.model
-        rows, gradient = _evaluate(model, y, held)
+        self._bare = bare = model.bare()
+        self._matrix_model = bare if structure.coarse is None else structure.coarse.model
+        rows, gradient = _evaluate(bare, y, held)
         self.gradient = np.asarray(gradient, np.float64)
         self.values = {name: np.asarray(row, np.float64) for name, row in rows.items()}
         """Rows of each prior, before they are weighed."""
@@ -446,9 +448,9 @@ class SparseEquations:
         return self.structure.arrange(normal_matrix(elements, by, weights, self._row_faces), self._n_shared)
 
     def _add_tied(self, tied: _Tied) -> Arrowhead:
-        prior, layout = self.model.prior(tied.prior), self.model.layout
+        prior, layout = self._bare.prior(tied.prior), self.model.layout
         assert isinstance(prior, AbstractVertexPrior)
-        by = _differentiate_tied(self.model, prior, self.y, self.held.priors[prior.name], tied.seeds)
+        by = _differentiate_tied(self._bare, prior, self.y, self.held.priors[prior.name], tied.seeds)
         by = np.asarray(by, np.float64)
         by = np.take_along_axis(by.T, tied.seeds_of, axis=1) if len(by) else np.zeros(tied.columns.shape)
         found = _sparse(by, tied.columns, layout.n)

@@ -276,7 +276,7 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
     def _turned_over(self, model: Model, y: Variables, step: AnyArray, xp: Any) -> Bool[AnyArray, "v"]:
         """Vertices of control faces that a step would turn upside down."""
         layout = model.layout
-        if not layout.has_vertices:
+        if not layout.has_vertices or (xp is np and not np.isfinite(step).all()):
             return xp.zeros(layout.n_vertices, bool)
         before = xp.asarray(y.control.vertices, step.dtype)
         moved = before + step[: layout.n_own].reshape(layout.n_vertices, layout.width)[:, :3]

@@ -99,6 +99,11 @@ class AbstractPrior(eqx.Module):
         """1 / variance of the rows: an array of them, or one for all."""
         raise NotImplementedError
 
+    def bare(self) -> "AbstractPrior":
+        """The prior without what only its strengths depend on: whether those are given or found, one compiled program
+        has its rows."""
+        return self
+
     @property
     def n_strengths(self) -> int:
         """How many strengths, 1 / variances of its rows, the prior has that a fit finds or anneals."""

@@ -1,5 +1,6 @@
 """Smoothness: edges bend at both ends alike, or as unevenly as the template's do."""
 
+import dataclasses
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -46,6 +47,10 @@ class Bend(AbstractFacePrior):
         likeness = np.zeros(()) if priors.likeness is None and priors.bend is not None else priors.likeness
         usual, n_faces = np.mean(bends**2), start.topology.n_control_faces
         return cls(edges, faces, expected, priors.bend, likeness, np.asarray(usual), n_faces)
+
+    def bare(self) -> "Bend":
+        nothing = np.zeros(())
+        return dataclasses.replace(self, given=nothing, likeness=nothing, usual=nothing)
 
     @property
     def n_strengths(self) -> int:

@@ -1,5 +1,6 @@
 """Shapes seen before: the control mesh is a mean shape, moved along its modes of variation, and something of its own."""
 
+import dataclasses
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -105,6 +106,9 @@ class ShapePrior(AbstractVertexPrior):
         dtype = start.control.vertices.dtype
         modes = (shape.modes * shape.deviations[:, None, None]).astype(dtype)
         return cls(shape.mean.astype(dtype), modes, shape.rest, widest / edge, edge)
+
+    def bare(self) -> "ShapePrior":
+        return dataclasses.replace(self, rest=None)
 
     @property
     def n_strengths(self) -> int:
