@@ -50,7 +50,7 @@ def fitted(chosen=None, **options) -> fitting.Cohort:
     """All options that change the compiled program stay the same from test to test."""
     problem = scans.problem()
     chosen = subjects() if chosen is None else chosen
-    given = {"priors": PRIORS, "max_sweeps": 40} | options
+    given = {"priors": PRIORS, "max_sweeps": 40, "tolerance": 0.01} | options
     return fitting.fit_cohort(js.Interpolating(), problem.topology, start(), chosen, **given)
 
 
@@ -74,7 +74,7 @@ def test_every_fit_is_as_one_of_its_own():
     found = cohort()
     assert found.converged.all() and len(found) == N_SUBJECTS
     for i, scan in enumerate(subjects()[:2]):
-        single = fitting.fit(js.Interpolating(), scans.problem().topology, start(), scan, priors=PRIORS, throw=False)
+        single = fitting.fit(js.Interpolating(), scans.problem().topology, start(), scan, priors=PRIORS, tolerance=0.01, throw=False)
         of_single, of_cohort = off(truths()[i], single.surface), off(truths()[i], surface(found, i))
         assert of_cohort < 1.1 * of_single + 0.01
         assert off(single.surface, surface(found, i)) < 0.3 * of_single
