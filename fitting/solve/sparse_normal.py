@@ -4,6 +4,7 @@ The matrix is an arrowhead, [A B; B' C]. A couples the unknowns of control verti
 that all rows share, as h, shifts of slices or scores of shape modes, and B both. One analysis serves all sweeps.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -473,7 +474,7 @@ class SparseNormal(lx.AbstractLinearSolver):
     """
 
     structure: Structure = eqx.field(static=True)
-    faces: Int[np.ndarray, "m"] | None = eqx.field(static=True, default=None)
+    faces: Int[Array | np.ndarray, "m"] | None = None
 
     def linearise(self, model: Model, y: Variables, held: Held) -> SparseEquations:
         """The rows of a fit about a place."""
@@ -499,30 +500,8 @@ class SparseNormal(lx.AbstractLinearSolver):
         by = jnp.concatenate([row for name, row in of_faces.items() if name not in tied], axis=1)
         of_ties = [(vector[one.prior], along(one.seeds)[one.prior]) for one in structure.tied]
         shape = jax.ShapeDtypeStruct((structure.layout.n,), dtype)
-        solution = jax.pure_callback(self._solve, shape, rows, by, of_ties)
+        solution = jax.pure_callback(functools.partial(_solve, structure), shape, self.faces, rows, by, of_ties)
         return structure.layout.split(solution), lx.RESULTS.successful, {}
-
-    def _solve(self, rows: Array, by: Array, of_ties: list[tuple[Array, Array]]) -> Float[np.ndarray, "n"]:
-        structure, faces, n = self.structure, self.faces, self.structure.layout.n
-        elements, n_shared = structure.elements, structure.layout.n - structure.n
-        rows, by = np.asarray(rows, np.float64), np.asarray(by, np.float64)
-        local = np.take_along_axis(by.T, elements.seeds_of[faces], axis=1)
-        gradient = np.zeros(n)
-        gradient[: elements.n] = times_transposed(elements, local, rows, faces)
-        matrix = structure.arrange(normal_matrix(elements, local, np.ones(len(rows)), faces), n_shared)
-        for tied, (values, along) in zip(structure.tied, of_ties, strict=True):
-            values, along = np.asarray(values, np.float64), np.asarray(along, np.float64)
-            found = _sparse(np.take_along_axis(along.T, tied.seeds_of, axis=1), tied.columns, n)
-            gradient += found.T @ values
-            matrix = matrix.plus(structure.arrange_sparse(sp.csc_array(found.T @ found)))
-        pattern = structure.pattern
-        values = matrix.inner.copy()
-        values[structure.diagonal] += _REGULAR * np.abs(values[structure.diagonal]).max()
-        inner = sp.csc_array((values, pattern.indices, pattern.indptr), shape=(structure.n, structure.n))
-        factor = structure.symbolic.factorise(inner)
-        solved = factor.solve(matrix.border) if n_shared else matrix.border
-        whole = ArrowheadFactor(factor, matrix.border, solved, _inverse(matrix.corner - matrix.border.T @ solved))
-        return whole.solve(gradient).astype(jax.dtypes.canonicalize_dtype(np.float64))
 
     def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         raise NotImplementedError("normal equations have no transpose that a fit would need.")
@@ -532,6 +511,32 @@ class SparseNormal(lx.AbstractLinearSolver):
 
     def assume_full_rank(self) -> bool:
         return True
+
+
+def _solve(
+    structure: Structure, faces: Array, rows: Array, by: Array, of_ties: list[tuple[Array, Array]]
+) -> Float[np.ndarray, "n"]:
+    """Least squares from the derivatives along the seeds."""
+    faces, n = np.asarray(faces), structure.layout.n
+    elements, n_shared = structure.elements, structure.layout.n - structure.n
+    rows, by = np.asarray(rows, np.float64), np.asarray(by, np.float64)
+    local = np.take_along_axis(by.T, elements.seeds_of[faces], axis=1)
+    gradient = np.zeros(n)
+    gradient[: elements.n] = times_transposed(elements, local, rows, faces)
+    matrix = structure.arrange(normal_matrix(elements, local, np.ones(len(rows)), faces), n_shared)
+    for tied, (values, along) in zip(structure.tied, of_ties, strict=True):
+        values, along = np.asarray(values, np.float64), np.asarray(along, np.float64)
+        found = _sparse(np.take_along_axis(along.T, tied.seeds_of, axis=1), tied.columns, n)
+        gradient += found.T @ values
+        matrix = matrix.plus(structure.arrange_sparse(sp.csc_array(found.T @ found)))
+    pattern = structure.pattern
+    values = matrix.inner.copy()
+    values[structure.diagonal] += _REGULAR * np.abs(values[structure.diagonal]).max()
+    inner = sp.csc_array((values, pattern.indices, pattern.indptr), shape=(structure.n, structure.n))
+    factor = structure.symbolic.factorise(inner)
+    solved = factor.solve(matrix.border) if n_shared else matrix.border
+    whole = ArrowheadFactor(factor, matrix.border, solved, _inverse(matrix.corner - matrix.border.T @ solved))
+    return whole.solve(gradient).astype(jax.dtypes.canonicalize_dtype(np.float64))
 
 
 def _sparse(by: Float[np.ndarray, "m d"], columns: Int[np.ndarray, "m d"], n: int) -> sp.csr_array:
