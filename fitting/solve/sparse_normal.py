@@ -471,10 +471,12 @@ class SparseNormal(lx.AbstractLinearSolver):
     Attributes:
         structure: which unknowns belong to which rows.
         faces: the control face of each distance and of each row of the face priors; None where only fits use it.
+        names: of these rows, in the same order.
     """
 
     structure: Structure = eqx.field(static=True)
     faces: Int[Array | np.ndarray, "m"] | None = None
+    names: tuple[str, ...] = eqx.field(static=True, default=())
 
     def linearise(self, model: Model, y: Variables, held: Held) -> SparseEquations:
         """The rows of a fit about a place."""
@@ -490,14 +492,13 @@ class SparseNormal(lx.AbstractLinearSolver):
     ) -> tuple[Unknowns, lx.RESULTS, dict[str, Any]]:
         structure = self.structure
         dtype = jax.tree.leaves(vector)[0].dtype
-        tied = {one.prior for one in structure.tied}
 
         def along(seeds: Float[np.ndarray, "s n"]) -> dict[str, Float[Array, "s m"]]:
             return jax.lax.map(lambda seed: state.mv(structure.layout.split(seed)), jnp.asarray(seeds, dtype))
 
         of_faces = along(structure.elements.seeds)
-        rows = jnp.concatenate([row for name, row in vector.items() if name not in tied])
-        by = jnp.concatenate([row for name, row in of_faces.items() if name not in tied], axis=1)
+        rows = jnp.concatenate([vector[name] for name in self.names])
+        by = jnp.concatenate([of_faces[name] for name in self.names], axis=1)
         of_ties = [(vector[one.prior], along(one.seeds)[one.prior]) for one in structure.tied]
         shape = jax.ShapeDtypeStruct((structure.layout.n,), dtype)
         solution = jax.pure_callback(functools.partial(_solve, structure), shape, self.faces, rows, by, of_ties)
@@ -573,4 +574,4 @@ def sparse_solver(model: Model, y: Variables, held: Held) -> SparseNormal:
     """The sparse normal equations of a residual's rows as a linear solver for `optx.GaussNewton`."""
     structure = find_structure(model, y, held.priors, coarse=False)
     faces = np.concatenate([structure.patches.owner[np.asarray(held.faces)], row_faces(model, held.priors)])
-    return SparseNormal(structure, faces)
+    return SparseNormal(structure, faces, ("distance", *(prior.name for prior in model.face_priors)))
