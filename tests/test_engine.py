@@ -134,6 +134,19 @@ def test_rows_of_a_fit_are_for_any_solver_of_least_squares():
     assert least <= at_fit < least + 0.5
 
 
+def test_rows_for_other_solvers_do_not_depend_on_what_is_fixed():
+    fixed = np.arange(12) % 3 == 0
+    model, y = analysed(js.Interpolating(), problem().topology, problem().truth, free=Free(vertices=~fixed))
+    rows = eqx.filter_jit(Residual(model).about(y))
+    held, zero = problem().fit(max_sweeps=0).fit.held(), Residual(model).about(y).zero
+    at_zero, moved, others = (
+        rows(eqx.tree_at(lambda one: one.vertices, zero, zero.vertices.at[which].set(1.0)), held)["stretch"]
+        for which in (fixed & ~fixed, fixed, ~fixed)
+    )
+    np.testing.assert_array_equal(moved, at_zero)
+    assert np.abs(others - at_zero).max() > 0.01
+
+
 # Shapes seen before
 
 
