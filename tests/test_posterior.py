@@ -8,140 +8,151 @@ import meshes
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from scans import N_POINTS, SIGMA, noise, problem
+from scans import N_POINTS, SIGMA, analysed, hold_everything, noise, problem
 from schemes import MIXED, control_mesh, random_control
 
 import fitting
 import jaxsubdiv as js
-from fitting import Free, Priors, Scan
-from fitting.model.residual import Pairs, Start, bend_edges, control_edges, control_faces_of, prior_faces, residuals
-from fitting.model.unknowns import no_offset
-from fitting.report import posterior as _posterior
+from fitting import Free, Priors, Residual, Scan
+from fitting.model.priors.bend import bend_asymmetry
+from fitting.model.residual import Pairs
 from fitting.report import refit as _refit
 from fitting.report.misfit import misfit_variances
 from fitting.solve import elements as _elements
 from fitting.solve.elements import (
     differentiate,
-    differentiate_distances,
     find_elements,
     find_patches,
-    flat,
     forgets_some,
     jacobian,
     normal_matrix,
-    to_unknowns,
+    times_transposed,
 )
-from fitting.solve.strengths import neighbourhoods, next_precision
+from fitting.solve.sparse_normal import SparseEquations, find_structure, row_faces
+from fitting.solve.strengths import Family, neighbourhood_mean, next_precisions
 
 # Derivatives by elements
 
 
 @functools.cache
 def mixed_rows(kind: str, levels: int):
-    """Everything that the elements of a mesh of triangles and quads are made from, and its derivatives in full."""
+    """The rows of a mesh of triangles and quads about one place, and their derivatives in full."""
     scheme = {
         "default": js.Interpolating(1.1),
         "h a level": js.Interpolating([1.1] * levels),
         "circle": js.CirclePreserving(),
-    }
-    scheme = scheme[kind]
-    mesh, free = control_mesh(MIXED), Free()
-    topology, control = js.build_topology(mesh, scheme, levels), random_control(MIXED, 0)
-    surface = js.refine(scheme, topology, control)
+    }[kind]
+    mesh, control = control_mesh(MIXED), random_control(MIXED, 0)
+    topology = js.build_topology(mesh, scheme, levels)
+    model, y = analysed(scheme, topology, control, priors=Priors(bend=1.0))
+    surface = model.refine(y)
     face = np.random.default_rng(1).integers(surface.n_faces, size=60)
     at = js.SurfacePoint(face, np.full((60, 2), 0.3))
-    corners, weights = js._surface.corner_weights(surface, at)
-    directions = js.evaluate(surface, at).normals
-    pairs = Pairs(js.evaluate(surface, at).points + 0.1 * directions, corners, weights, directions)
-    edges = control_edges(topology), bend_edges(scheme, topology)
-    start = Start(scheme, topology, control, jnp.asarray(mesh.vertices), None, *edges)
-    zero = no_offset(free, scheme, control)
-    owner = control_faces_of(scheme, topology, surface, control)
-    faces = prior_faces(scheme, topology, None, owner, zero.h.size)
-    patches = find_patches(surface, owner, mesh.n_faces)
+    corners, weights = js.corner_weights(surface, at)
+    on, directions = js.evaluate(surface, at)
+    held = hold_everything(model, y, Pairs(on + 0.1 * directions, corners, weights, directions), face)
+    precisions = {"distance": np.random.default_rng(2).uniform(0.5, 2, 60)}
+    for name, row in Residual(model).rows(y, held).items():
+        precisions[name] = (
+            np.random.default_rng(len(row)).uniform(0.5, 2, len(row)) if name != "distance" else precisions[name]
+        )
+    held = held._replace(distance_precisions=precisions.pop("distance"), precisions=precisions)
+    of_offsets, split = Residual(model).about(y), model.layout.split
 
     @jax.jit
-    def in_full(start, pairs):
-        def of_vector(vector):
-            return jnp.concatenate(residuals(to_unknowns(vector, zero), start, pairs))
+    def in_full(vector):
+        return of_offsets.residual.rows(model.retract(y, split(vector)), held)
 
-        return jax.jacfwd(of_vector)(jnp.zeros(flat(zero).size))
+    zero = jnp.zeros(model.layout.n)
+    by = {name: np.asarray(rows) for name, rows in jax.jacfwd(in_full)(zero).items()}
+    return model, y, held, by
 
-    return start, pairs, zero, face, patches, np.concatenate(faces), np.asarray(in_full(start, pairs))
 
-
-def by_elements(kind: str, levels: int, rings: int):
-    start, pairs, zero, at, patches, of_priors, in_full = mixed_rows(kind, levels)
-    elements = find_elements(start.topology, Free(), start, rings)
-    tables = elements.seeds, elements.seeds_of, of_priors, patches.vertices
-    return elements, differentiate(zero, start, *tables), pairs, at, patches, of_priors, in_full
+def dense(equations: SparseEquations, matrix) -> np.ndarray:
+    """An arrowhead, without damping, as a whole."""
+    return equations.multiply(matrix, np.eye(equations.model.layout.n))
 
 
 @pytest.mark.parametrize(("kind", "levels"), [("default", 2), ("h a level", 2), ("circle", 1)])
 def test_derivatives_by_elements_are_those_in_full(kind, levels):
-    elements, found, pairs, at, patches, of_priors, in_full = by_elements(kind, levels, rings=1)
-    assert not forgets_some(elements, patches, found, of_priors)
-    face = np.append(patches.owner[at], of_priors)
-    distances, by = differentiate_distances(found, pairs, face[: len(at)], patches.slots[at])
-    np.testing.assert_allclose(distances, -0.1, atol=1e-12)
-    by = np.concatenate([by, found.by_rows])
-    np.testing.assert_allclose(jacobian(elements, by, face).toarray(), in_full, atol=1e-12)
+    model, y, held, in_full = mixed_rows(kind, levels)
+    structure = find_structure(model, y, held.priors, coarse=False)
+    equations = SparseEquations(structure, model, y, held)
+    np.testing.assert_allclose(equations.values["distance"], -0.1, atol=1e-12)
+    for name in in_full.keys() - {"distance"}:
+        np.testing.assert_allclose(equations.jacobian(name).toarray(), in_full[name], atol=1e-12, err_msg=name)
     # Far fewer derivatives than unknowns: that is what the colours are for.
-    assert elements.seeds.vertices.shape[0] < 0.75 * in_full.shape[1]
+    assert structure.elements.seeds.shape[0] < 0.75 * model.layout.n
+    weights = {"distance": held.distance_precisions} | held.precisions
+    products = {name: by.T @ (weights[name][:, None] * by) for name, by in in_full.items()}
+    np.testing.assert_allclose(dense(equations, equations.data), products.pop("distance"), atol=1e-10)
+    np.testing.assert_allclose(dense(equations, equations.prior), sum(products.values()), atol=1e-10)
+    gradient = sum(by.T @ (weights[name] * equations.values[name]) for name, by in in_full.items())
+    np.testing.assert_allclose(equations.gradient, gradient, atol=1e-10)
 
-    def matrix(values):
-        pattern = elements.pattern
-        return sp.csc_array((values, pattern.indices, pattern.indptr), shape=pattern.shape).toarray()
 
-    weights = np.random.default_rng(2).uniform(0.5, 2, len(face))
-    np.testing.assert_allclose(
-        matrix(normal_matrix(elements, by, weights, face)), in_full.T @ (weights[:, None] * in_full), atol=1e-10
-    )
-    np.testing.assert_allclose(_elements.times_transposed(elements, by, weights, face), in_full.T @ weights, atol=1e-10)
-    # Summed up a patch at a time, as it is done where there are many pairs.
-    of_pairs, weights = in_full[: len(at)], weights[: len(at)]
-    for at_once in (1 << 22, 5 * elements.columns.shape[1] ** 2):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(_elements, "_ENTRIES_AT_ONCE", at_once)
-            _, runs = _elements._pattern(elements.columns, elements.n)
-        assert len(runs) == (1 if at_once == 1 << 22 else -(-len(elements.columns) // 5))
-        parts = elements._replace(runs=runs)
-        values, gradient = _elements.equations_of_many(parts, patches, found, pairs, weights, at)
-        np.testing.assert_allclose(matrix(values), of_pairs.T @ (weights[:, None] * of_pairs), atol=1e-10)
-        one_by_one = normal_matrix(parts, by[: len(at)], weights, face[: len(at)])
-        np.testing.assert_allclose(matrix(one_by_one), of_pairs.T @ (weights[:, None] * of_pairs), atol=1e-10)
-        np.testing.assert_allclose(gradient, of_pairs.T @ (-0.1 * weights), atol=1e-10)
+def test_sums_over_parts_of_the_faces_are_those_over_all(monkeypatch):
+    """A few faces at a time, as it is done where there are many."""
+    model, y, held, in_full = mixed_rows("default", 2)
+    elements = find_structure(model, y, held.priors, coarse=False).elements
+    monkeypatch.setattr(_elements, "_ENTRIES_AT_ONCE", 5 * elements.columns.shape[1] ** 2)
+    structure = find_structure(model, y, held.priors, coarse=False)
+    assert len(elements.runs) == 1 and len(structure.elements.runs) == -(-len(elements.columns) // 5)
+    equations = SparseEquations(structure, model, y, held)
+    by, weights = in_full["distance"], held.distance_precisions
+    np.testing.assert_allclose(dense(equations, equations.data), by.T @ (weights[:, None] * by), atol=1e-10)
+    products = [by.T @ (held.precisions[name][:, None] * by) for name, by in in_full.items() if name != "distance"]
+    np.testing.assert_allclose(dense(equations, equations.prior), sum(products), atol=1e-10)
+
+
+def test_rows_of_a_face_make_matrices_and_gradients():
+    """More rows a face than are multiplied at once."""
+    model, y, held, _ = mixed_rows("default", 2)
+    elements = find_structure(model, y, held.priors, coarse=False).elements
+    rng, m = np.random.default_rng(3), 40 * len(elements.columns)
+    face, weights = rng.integers(len(elements.columns), size=m), rng.uniform(0.5, 2, m)
+    by = np.where(elements.columns[face] < elements.n, rng.normal(size=(m, elements.columns.shape[1])), 0.0)
+    whole, pattern = jacobian(elements, by, face).toarray(), elements.pattern
+    values = normal_matrix(elements, by, weights, face)
+    found = sp.csc_array((values, pattern.indices, pattern.indptr), shape=pattern.shape).toarray()
+    np.testing.assert_allclose(found, whole.T @ (weights[:, None] * whole), atol=1e-10)
+    np.testing.assert_allclose(times_transposed(elements, by, weights, face), whole.T @ weights, atol=1e-10)
 
 
 def test_elements_that_are_too_small_are_noticed():
-    elements, found, _, _, patches, of_priors, _ = by_elements("default", 2, rings=0)
-    assert forgets_some(elements, patches, found, of_priors)
+    model, y, held, _ = mixed_rows("default", 2)
+    surface = model.refine(y)
+    owner = js.control_faces_of(model.scheme, model.topology, surface, y.control)
+    patches, rows = find_patches(surface, owner, model.topology.n_control_faces), row_faces(model, held.priors)
+    for rings in (0, 1):
+        elements = find_elements(model, rings)
+        found = differentiate(model, y, held.priors, elements.seeds, elements.seeds_of, rows, patches.vertices)
+        assert forgets_some(elements, patches, found, rows) == (rings == 0)
 
 
-def test_vectors_of_unknowns_go_to_offsets_and_back():
-    start, _, zero, *_ = mixed_rows("h a level", 2)
-    vector = np.arange(flat(zero).size, dtype=float)
-    np.testing.assert_array_equal(flat(to_unknowns(jnp.asarray(vector), zero)), vector)
-    for free in (Free(normals=False), Free(vertices=False), Free(True, True, False), Free(False, False, True)):
-        like = no_offset(free, start.scheme, start.control)
-        vector = np.arange(flat(like).size, dtype=float)
-        np.testing.assert_array_equal(flat(to_unknowns(jnp.asarray(vector), like)), vector)
-
-
-@pytest.mark.parametrize("n", [1, 7, 100, 5_000])
-def test_pairs_come_in_runs_that_few_programs_serve(n, monkeypatch):
-    monkeypatch.setattr(_elements, "_PAIRS_AT_ONCE", 512)
-    rows = np.arange(n)
-    pairs = Pairs(*(jnp.asarray(np.tile(rows[:, None], (1, width))) for width in (3, 4, 4, 3)))
-    runs = list(_elements.padded(pairs, np.ones(n), rows))
-    sizes = {len(face) for _, _, face in runs}
-    assert len(sizes) == 1 and sizes.pop() <= max(512, 1.34 * n)
-    counted = np.concatenate([face[weights > 0] for _, weights, face in runs])
-    np.testing.assert_array_equal(counted, rows)
-    np.testing.assert_array_equal(runs[-1][0].points[:, 0], runs[-1][2])
+@pytest.mark.parametrize(
+    "free", [Free(), Free(normals=False), Free(vertices=False), Free(True, True, False), Free(False, False, True)]
+)
+def test_vectors_of_unknowns_go_to_offsets_and_back(free):
+    model, _ = analysed(js.Interpolating(), problem().topology, problem().truth, free=free)
+    vector = np.arange(model.layout.n, dtype=float)
+    offset = model.layout.split(jnp.asarray(vector))
+    np.testing.assert_array_equal(model.layout.join(offset), vector)
+    assert (offset.vertices is None, offset.normals is None) == (free.vertices is False, free.normals is False)
+    if offset.vertices is not None:
+        np.testing.assert_array_equal(offset.vertices[1], model.layout.width + np.arange(3))
 
 
 # Smoothness from the scan
+
+
+class Bends:
+    """Rows that are the unknowns themselves."""
+
+    def times(self, name, x):
+        return x
+
+    transposed = times
 
 
 def test_strength_of_the_prior_is_that_which_the_unknowns_were_drawn_with():
@@ -150,19 +161,16 @@ def test_strength_of_the_prior_is_that_which_the_unknowns_were_drawn_with():
     face = np.repeat(np.arange(n // 8), 8)
     truth = np.where(np.arange(n) < n // 2, 1.0, 0.1)
     measured = rng.normal(scale=truth) + rng.normal(scale=0.3, size=n)
-    around = sp.csr_array(np.abs(np.subtract.outer(range(n // 8), range(n // 8))) <= 3, dtype=float)
-    around = sp.diags_array(1 / around.sum(axis=1)) @ around
-    precision = np.full(n // 8, 4.0)
+    around = np.abs(np.subtract.outer(range(n // 8), range(n // 8))) <= 3
+    around = around / around.sum(axis=1, keepdims=True)
+    precision, rows = np.full(n // 8, 4.0), Bends()
     for _ in range(30):
         prior, data = precision[face], 1 / 0.3**2
-        precision = next_precision(
-            precision,
-            measured * data / (data + prior),
-            sp.eye_array(n, format="csr"),
-            face,
+        (precision,) = next_precisions(
+            [Family("bend", precision, measured * data / (data + prior), face, lambda values: around @ values)],
+            rows,
             lambda sides, prior=prior: sides / (prior + 1e-9)[:, None],
             lambda sides, prior=prior, data=data: sides / (prior + data)[:, None],
-            around,
         )
     deviation = precision**-0.5
     # The smooth end, which shows little beside the noise, leans a little on the rest.
@@ -171,9 +179,11 @@ def test_strength_of_the_prior_is_that_which_the_unknowns_were_drawn_with():
 
 def test_neighbourhoods_average():
     mesh = control_mesh(meshes.grid(4, 3, "mixed"))
-    around = neighbourhoods(js.build_topology(mesh, js.Interpolating(), 1))
-    np.testing.assert_allclose(around @ np.ones(mesh.n_faces), 1)
-    assert 0.1 < np.abs(around @ np.eye(mesh.n_faces)[0]).max() < 0.9
+    average = neighbourhood_mean(js.build_topology(mesh, js.Interpolating(), 1))
+    np.testing.assert_allclose(average(np.ones(mesh.n_faces)), 1)
+    of_first = average(np.eye(mesh.n_faces)[0])
+    assert 0.1 < np.abs(of_first).max() < 0.9
+    np.testing.assert_allclose(average(jnp.asarray(np.eye(mesh.n_faces)[0])), of_first, atol=1e-12)
 
 
 def to_truth(result: fitting.FitResult) -> float:
@@ -183,7 +193,7 @@ def to_truth(result: fitting.FitResult) -> float:
 
 
 def roughness(result: fitting.FitResult) -> float:
-    bends = fitting.model.residual.bend_asymmetry(result.surface, bend_edges(result.scheme, problem().topology))
+    bends = bend_asymmetry(result.surface, result.fit.model.prior("bend").edges)
     return float(np.sqrt(np.mean(bends**2)))
 
 
@@ -292,7 +302,10 @@ def test_misfit_is_what_points_of_a_face_have_in_common_beyond_the_noise():
     """Faces whose height is fitted three at a time, by the mean of their points: a mesh that is too coarse for them."""
     rng, n_faces, n, sigma = np.random.default_rng(0), 3000, 12, 0.5
     face = np.repeat(np.arange(n_faces), n)
-    around = sp.csr_array(np.kron(np.eye(n_faces // 300), np.full((300, 300), 1 / 300)))
+
+    def average(values):
+        return values.reshape(-1, 300).mean(axis=1).repeat(300)
+
     weights = np.where(rng.uniform(size=len(face)) < 0.2, 0.0, 1.0)  # outliers, which say nothing
     for height in (0.3, 0.0):
         truth = height * rng.choice([-1.0, 1.0], size=n_faces)
@@ -302,22 +315,32 @@ def test_misfit_is_what_points_of_a_face_have_in_common_beyond_the_noise():
         fitted = np.bincount(of_three, weights * measured) / counts
         off = fitted[np.arange(n_faces) // 3] - truth
         variance = sigma**2 / counts
-        found = misfit_variances(measured - fitted[of_three], weights, variance[of_three], [face], around)
+        found = misfit_variances(measured - fitted[of_three], weights, variance[of_three], [face], average, n_faces)
         expected = max(np.mean(off**2) - np.mean(variance), 0)
         np.testing.assert_allclose(np.mean(found), expected, atol=0.05 * height**2 + 0.001)
     alone = np.arange(n_faces)  # one point a face: nothing in common
-    none = misfit_variances(np.ones(n_faces), np.ones(n_faces), np.zeros(n_faces), [alone], around)
+    none = misfit_variances(np.ones(n_faces), np.ones(n_faces), np.zeros(n_faces), [alone], average, n_faces)
     np.testing.assert_array_equal(none, 0)
 
 
-def test_uncertainty_from_draws_is_the_exact_one(monkeypatch):
-    posterior = problem().fit(problem().points + noise(), max_sweeps=4).posterior
-    exact = posterior.uncertainty().surface
+def test_draws_are_of_the_posterior_and_so_is_the_uncertainty():
+    """Against the inverse of the whole matrix."""
+    found = problem().fit(problem().points + noise(), max_sweeps=4)
+    posterior, layout = found.posterior, found.fit.model.layout
+    covariance = np.linalg.inv(posterior.equations.to_dense(found.fit.loose, np.arange(layout.n)))
     draws = posterior.draws(4000)
-    np.testing.assert_allclose(draws @ draws.T / 4000, np.linalg.inv(posterior.matrix.toarray()), atol=0.02)
-    monkeypatch.setattr(_posterior, "DENSE", 0)
-    monkeypatch.setattr(_posterior, "_DRAWS", 2000)
-    np.testing.assert_allclose(posterior.uncertainty().surface, exact, rtol=0.08)
+    np.testing.assert_allclose(draws @ draws.T / 4000, covariance, atol=0.02)
+
+    @jax.jit
+    def vertices_along_normals(vector):
+        moved = found.fit.model.refine(found.fit.model.retract(found.fit.y, layout.split(vector)))
+        return jnp.sum(moved.vertices * found.surface.normals, axis=1)
+
+    by = np.asarray(jax.jacfwd(vertices_along_normals)(jnp.zeros(layout.n)))
+    deviation = posterior.uncertainty()
+    exact = np.sqrt(np.einsum("vn,nm,vm->v", by, covariance, by))
+    np.testing.assert_allclose(np.sqrt(deviation.surface**2 - deviation.misfit**2), exact, rtol=1e-6)
+    np.testing.assert_allclose(deviation.control, exact[:12], rtol=1e-6)
 
 
 def test_what_is_fixed_is_certain():

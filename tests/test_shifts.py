@@ -11,7 +11,8 @@ from scans import N_POINTS, assert_refit_knows_the_fit, noise, problem
 import fitting
 import jaxsubdiv as js
 from fitting import Free, Priors, Scan, ScanError, read_scan
-from fitting.model.priors.shifts import find_shifts, find_strokes
+from fitting.model.priors.shifts import find_slice_planes
+from fitting.scan.slices import find_strokes
 
 N_SLICES = 10
 PLANTED = 2.0  # mm: standard deviation of the shifts along each axis
@@ -111,7 +112,7 @@ def test_points_of_a_stroke_count_as_few(monkeypatch):
     drawn = Scan(points + stroke * across / np.linalg.norm(across, axis=1, keepdims=True), slices=slices)
     how = {"free": Free(shifts=False), "priors": Priors(likeness=0.0)}
     few = fit_slices(drawn, **how)
-    monkeypatch.setattr("fitting.model.view.find_strokes", lambda scan: None)
+    monkeypatch.setattr("fitting.model.pairing.find_strokes", lambda scan: None)
     many = fit_slices(drawn, **how)
     assert off_truth(few) < 0.9 * off_truth(many)
     deviations = [found.uncertainty() for found in (few, many)]
@@ -144,9 +145,13 @@ def test_report_has_the_shifts():
 
 def test_uncertainty_knows_that_the_shifts_are_unknown():
     """The surface's covariance is a block of the inverse of the whole: it is wider than if the shifts were known."""
-    posterior = shifted().posterior
-    whole, n = posterior.matrix.toarray(), posterior.n_free
-    free, known = np.linalg.inv(whole)[:n, :n], np.linalg.inv(whole[:n, :n])
+    fit, posterior = shifted().fit, shifted().posterior
+    layout, equations = fit.model.layout, posterior.equations
+    n = layout.columns("shifts").start
+    names = [name for name, of in layout.shared for _ in range(int(np.prod(of.shape, dtype=int)))]
+    others = ~np.isin(names, ["shifts", "motion"])  # a motion of the whole goes with the shifts
+    with_known = equations.factorise(equations.data.plus(equations.prior), fit.loose, others)
+    free, known = (of.solve(np.eye(layout.n))[:n, :n] for of in (posterior.factor, with_known))
     assert np.linalg.eigvalsh(free - known).min() > -1e-9
     # As a whole the surface is where the mean of the slices is, to PLANTED or so over their root.
     axis = 5 * np.arange(12)
@@ -177,8 +182,8 @@ def test_saved_fit_has_its_shifts(tmp_path):
     assert again.recipe.free.shifts and float(again.recipe.priors.shift) == 3.0
     with np.load(tmp_path / "fit.npz") as file:
         arrays = dict(file)
-    np.savez(tmp_path / "fit.npz", **(arrays | {"slices": np.arange(N_SLICES)}))
-    with pytest.raises(ValueError, match=r"fit\.npz: 'slices' are not those of the scan that may move"):
+    np.savez(tmp_path / "fit.npz", **(arrays | {"shared_shifts": np.zeros((N_SLICES - 1, 2))}))
+    with pytest.raises(ValueError, match=r"fit\.npz: 'shared_shifts' has the shape \[9, 2\] and not \[10, 2\]"):
         fitting.load(tmp_path)
 
 
@@ -197,10 +202,8 @@ def test_fit_that_was_stopped_goes_on_with_its_shifts(tmp_path, sweeps):
     np.testing.assert_array_equal(again.control.vertices, shifted().control.vertices)
 
 
-def test_cohort_leaves_slices_where_they_are_or_says_that_it_does_not_shift_them():
+def test_cohort_leaves_slices_where_they_are_where_they_are_not_free():
     p = problem()
-    with pytest.raises(ScanError, match=r"scan 0: it has slices, which a cohort does not shift\. Give `free=Free"):
-        fitting.fit_cohort(js.Interpolating(), p.topology, p.start, [displaced()])
     options = {"free": Free(shifts=False), "priors": Priors(bend=0.5), "max_sweeps": 1}
     with pytest.warns(UserWarning, match="did not converge"):
         cohort = fitting.fit_cohort(js.Interpolating(), p.topology, p.start, [displaced()], **options)
@@ -237,21 +240,25 @@ def test_slices_that_are_short_of_points_or_straight_or_thick_stay():
     parts = {7: circle, 2: circle[:9], 5: circle * (1, 0.05, 1), 9: rng.normal(size=(40, 3)), -1: circle[:, [2, 0, 1]]}
     points = np.concatenate(list(parts.values()))
     slices = np.repeat(list(parts), [len(rows) for rows in parts.values()])
-    found = find_shifts(Scan(points, slices=slices))
-    np.testing.assert_array_equal(found.slices, [-1, 7])
-    np.testing.assert_array_equal(found.of_point >= 0, np.isin(slices, [-1, 7]))
+    found = find_slice_planes(Scan(points, slices=slices))
+    np.testing.assert_array_equal(found.numbers, [-1, 7])
+    np.testing.assert_array_equal(found.rows_of(Scan(points, slices=slices)) >= 0, np.isin(slices, [-1, 7]))
     np.testing.assert_allclose(found.planes[0, :, 0], 0, atol=1e-12)
     np.testing.assert_allclose(found.planes @ found.planes.swapaxes(1, 2), np.tile(np.eye(2), (2, 1, 1)), atol=1e-12)
     ignored = np.where(slices == 7, 0.0, 1.0)
-    np.testing.assert_array_equal(find_shifts(Scan(points, weights=ignored, slices=slices)).slices, [-1])
-    assert find_shifts(Scan(points)) is None and find_shifts(Scan(points, slices=np.arange(len(points)))) is None
+    np.testing.assert_array_equal(find_slice_planes(Scan(points, weights=ignored, slices=slices)).numbers, [-1])
+    assert find_slice_planes(Scan(points)) is None
+    assert find_slice_planes(Scan(points, slices=np.arange(len(points)))) is None
 
 
-def test_shifts_are_at_what_they_were_told():
-    found = find_shifts(displaced())
-    vectors = np.pad(np.random.default_rng(0).normal(size=(N_SLICES, 2)), [(0, 0), (0, 1)])
-    np.testing.assert_allclose(found.at(vectors).vectors, vectors, atol=0.01)
-    np.testing.assert_array_equal(found.vectors, 0)
+def test_slices_of_another_scan_have_the_shifts_of_their_numbers():
+    scan, result = displaced(), shifted()
+    some = np.isin(np.arange(N_POINTS) // 60, [1, 4, 5])
+    number = np.where(scan.slices[some] == 12, 100, scan.slices[some])  # which the fit did not see
+    part = result.on(Scan(scan.points[some], slices=number))
+    by = np.where((number == 100)[:, None], 0.0, result.shifts[scan.slices[some] // 3])
+    np.testing.assert_allclose(part.points - scan.points[some], by, atol=1e-12)
+    np.testing.assert_allclose(part.distances[number < 100], result.distances[some][number < 100], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -313,4 +320,4 @@ def test_labels_and_slices_that_there_are_not_are_named(tmp_path):
 def test_contours_of_a_heart(shared_data):
     scan = read_scan(shared_data / "heart_guidepoints_a.csv", labels="LV_ENDOCARDIAL")
     assert scan.n_points == 5200 and scan.weights.shape == (5200,)
-    np.testing.assert_array_equal(find_shifts(scan).slices, np.arange(1, 21))
+    np.testing.assert_array_equal(find_slice_planes(scan).numbers, np.arange(1, 21))

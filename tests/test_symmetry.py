@@ -7,15 +7,15 @@ import jax.numpy as jnp
 import meshes
 import numpy as np
 import pytest
-from scans import N_POINTS, assert_refit_knows_the_fit, noise, problem
+from scans import N_POINTS, analysed, assert_refit_knows_the_fit, noise, problem
 from scipy.spatial.transform import Rotation
 
 import fitting
 import jaxsubdiv as js
-from fitting import Free, Priors, Recipe, Scan, Symmetry, _fit_scan, _symmetry, find_symmetry
-from fitting.model.priors.symmetry import Plane, mirror_at, ties
-from fitting.model.unknowns import apply_offset, no_offset
-from fitting.solve.elements import flat, to_unknowns
+from fitting import Free, Priors, Recipe, Scan, Symmetry, find_symmetry
+from fitting.model.priors.symmetry import Plane
+from fitting.run import fit_scan as _fit_scan
+from fitting.solve import sweeps
 
 STRICT = Priors(symmetry=0.01)
 
@@ -84,31 +84,41 @@ def test_tolerance_is_how_far_a_vertex_may_be_off():
 
 
 @pytest.mark.parametrize("free", [Free(), Free(normals=False), Free(vertices=False, h=False)])
-def test_rows_and_their_derivatives(free):
-    p, scheme = problem(), js.Interpolating()
+def test_rows_and_their_derivatives_by_the_plane(free):
+    p = problem()
     normals = p.start.normals / np.linalg.norm(p.start.normals, axis=1, keepdims=True)
-    control, zero = js.Control(p.start.vertices, normals), no_offset(free, scheme, p.start)
-    mirror = mirror_at(find_symmetry(p.mesh), 0.5, p.topology, control, zero)
-    found = ties(mirror, control, zero)
-    departure = (np.asarray(control.vertices) - find_symmetry(p.mesh).mirrored(control.vertices)) / 0.5
-    np.testing.assert_allclose(found.rows[:12].reshape(-1, 3), departure[mirror.left], atol=1e-12)
+    control = js.Control(p.start.vertices, normals)
+    options = {"free": free, "priors": Priors(symmetry=0.5), "symmetry": find_symmetry(p.mesh)}
+    model, y = analysed(js.Interpolating(), p.topology, control, **options)
+    prior, place = model.prior("symmetry"), model.place(y)
+    held, pairs = prior.hold(place, {}), np.arange(12) < find_symmetry(p.mesh).partner
+    departure = np.asarray(control.vertices) - find_symmetry(p.mesh).mirrored(control.vertices)
+    rows = np.asarray(prior.rows(place, held))
+    n = 3 * pairs.sum()
+    np.testing.assert_allclose(rows[:n].reshape(-1, 3), departure[pairs], atol=1e-12)
+    assert len(rows) == (2 if np.any(free.normals) else 1) * (
+        n + (find_symmetry(p.mesh).partner == np.arange(12)).sum()
+    )
+    np.testing.assert_allclose(prior.precisions({}), 0.5**-2)
 
-    @jax.jit
-    @jax.jacfwd
-    def rows_by(vector):
-        return mirror.rows(apply_offset(p.topology, scheme, control, to_unknowns(vector, zero))[1], jnp)
-
-    np.testing.assert_allclose(found.by.toarray(), rows_by(jnp.zeros(flat(zero).size)), atol=1e-12)
-
-    @jax.jit
-    @jax.jacfwd
     def rows_by_plane(change):
-        tangents = np.linalg.svd(mirror.plane.normal[None])[2][1:]
-        normal = mirror.plane.normal + change[1:] @ tangents
-        plane = Plane(mirror.plane.middle + change[0] * mirror.plane.normal, normal / jnp.linalg.norm(normal))
-        return mirror._replace(plane=plane).rows(control, jnp)
+        """Of a mirror that is shifted along its normal, and turned."""
+        turned = held.plane.normal + (change[1:] / held.extent) @ held.turns
+        plane = Plane(held.plane.middle + change[0] * held.plane.normal, turned / jnp.linalg.norm(turned))
+        off, leaning = (control.vertices - plane.mirrored(control.vertices)[prior.partner]), []
+        found = [off[prior.left].reshape(-1), (control.vertices[prior.on_plane] - plane.middle) @ plane.normal]
+        if np.any(free.normals):
+            across = Plane(jnp.zeros(3), plane.normal)
+            leaning = control.normals - across.mirrored(control.normals)[prior.partner]
+            found += [held.lever * leaning[prior.left].reshape(-1)]
+            found += [held.lever * control.normals[prior.on_plane] @ plane.normal]
+        return jnp.concatenate(found)
 
-    np.testing.assert_allclose(found.by_plane, rows_by_plane(jnp.zeros(3)), atol=1e-12)
+    def rows_by_unknown(change):
+        return prior.rows(place._replace(shared={**place.shared, "mirror": change}), held)
+
+    by, expected = (jax.jit(jax.jacfwd(of))(jnp.zeros(3)) for of in (rows_by_unknown, rows_by_plane))
+    np.testing.assert_allclose(by, expected, atol=1e-12)
 
 
 # The prior
@@ -160,10 +170,15 @@ def test_deviation_is_how_far_the_fit_departs_from_symmetry():
 
 def test_normals_are_tied_too():
     found, partners = fitted(0.01), find_symmetry(problem().mesh)
-    plane = _symmetry._plane_of(partners.partner, np.asarray(found.control.vertices))
+    plane = _plane(found)
     normals = np.asarray(found.control.normals)[partners.partner]
     image = normals - 2 * (normals @ plane.normal)[:, None] * plane.normal
     np.testing.assert_allclose(image, found.control.normals, atol=0.01)
+
+
+def _plane(found: fitting.FitResult) -> Plane:
+    """The plane of a fit."""
+    return found.fit.held().priors["symmetry"].plane
 
 
 def test_plane_moves_along_with_the_mesh(monkeypatch):
@@ -171,7 +186,13 @@ def test_plane_moves_along_with_the_mesh(monkeypatch):
     everywhere = np.ones(N_POINTS, bool)
     found, straight = fitted(0.01, beside=4.0), fitted(0.01)
     assert len(found.rms) <= len(straight.rms) + 2 and off(found, everywhere) < 1.1 * off(straight, everywhere)
-    monkeypatch.setattr(_symmetry.Ties, "with_plane", lambda self, step, *_: step)
+    loose = sweeps.active_unknowns
+
+    def hold_the_plane(model, shifting, xp=np):
+        names = [name for name, of in model.layout.shared for _ in range(int(np.prod(of.shape, dtype=int)))]
+        return loose(model, shifting, xp) & (np.array(names) != "mirror")
+
+    monkeypatch.setattr(sweeps, "active_unknowns", hold_the_plane)
     held = fitted.__wrapped__(0.01, beside=4.0)
     assert len(held.rms) > len(found.rms) + 10 or off(held, everywhere) > 3 * off(found, everywhere)
 
@@ -249,12 +270,6 @@ def test_start_that_is_not_symmetric_needs_partners():
         p.fit(priors=STRICT, control=control)
     found = p.fit(priors=STRICT, control=control, symmetry=find_symmetry(p.mesh))
     assert np.abs(find_symmetry(p.mesh).mirrored(found.control.vertices) - found.control.vertices).max() < 0.05
-
-
-def test_cohort_has_no_symmetry():
-    p = problem()
-    with pytest.raises(ValueError, match="a cohort has no prior of symmetry"):
-        fitting.fit_cohort(js.Interpolating(), p.topology, p.start, [Scan(p.points)], priors=STRICT)
 
 
 def test_fit_scan_takes_the_partners_from_the_template_and_its_split(monkeypatch):

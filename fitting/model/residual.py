@@ -166,7 +166,9 @@ class OffsetResidual(eqx.Module):
     y: Variables
 
     def __call__(self, offset: Unknowns, held: Held) -> dict[str, Float[Array, "_"]]:
-        return self.residual(self.residual.model.retract(self.y, offset), held)
+        model = self.residual.model
+        free = model.layout.join(offset, jnp) * jnp.asarray(model.is_free, self.y.control.vertices.dtype)
+        return self.residual(model.retract(self.y, model.layout.split(free)), held)
 
     @property
     def zero(self) -> Unknowns:

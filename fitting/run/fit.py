@@ -150,11 +150,13 @@ def fit(
     state = solver.init(subject_residual, y, subject, {}, None, None, nothing)
     if kept is not None and (before := kept.read_tree((y, state))) is not None:
         y, state = before
+    # Where JAX solves, a sweep is one program; on the host it is many small ones between sparse matrices.
+    step = solver.step if isinstance(solver.linear_solver, SparseNormal) else eqx.filter_jit(solver.step)
     done, result = False, optx.RESULTS.successful
     while not done:
         k = int(state.sweep)
         moved = float(state.moved)
-        y, state, _ = solver.step(subject_residual, y, subject, {}, state, nothing)
+        y, state, _ = step(subject_residual, y, subject, {}, state, nothing)
         done, result = solver.terminate(subject_residual, y, subject, {}, state, nothing)
         if k == 0:
             _warn_if_far(float(np.median(np.abs(state.look.distances))), control)

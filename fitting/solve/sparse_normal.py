@@ -4,6 +4,7 @@ The matrix is an arrowhead, [A B; B' C]. A couples the unknowns of control verti
 that all rows share, as h, shifts of slices or scores of shape modes, and B both. One analysis serves all sweeps.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -470,10 +471,12 @@ class SparseNormal(lx.AbstractLinearSolver):
     Attributes:
         structure: which unknowns belong to which rows.
         faces: the control face of each distance and of each row of the face priors; None where only fits use it.
+        names: of these rows, in the same order.
     """
 
     structure: Structure = eqx.field(static=True)
-    faces: Int[np.ndarray, "m"] | None = eqx.field(static=True, default=None)
+    faces: Int[Array | np.ndarray, "m"] | None = None
+    names: tuple[str, ...] = eqx.field(static=True, default=())
 
     def linearise(self, model: Model, y: Variables, held: Held) -> SparseEquations:
         """The rows of a fit about a place."""
@@ -489,40 +492,17 @@ class SparseNormal(lx.AbstractLinearSolver):
     ) -> tuple[Unknowns, lx.RESULTS, dict[str, Any]]:
         structure = self.structure
         dtype = jax.tree.leaves(vector)[0].dtype
-        tied = {one.prior for one in structure.tied}
 
         def along(seeds: Float[np.ndarray, "s n"]) -> dict[str, Float[Array, "s m"]]:
             return jax.lax.map(lambda seed: state.mv(structure.layout.split(seed)), jnp.asarray(seeds, dtype))
 
         of_faces = along(structure.elements.seeds)
-        rows = jnp.concatenate([row for name, row in vector.items() if name not in tied])
-        by = jnp.concatenate([row for name, row in of_faces.items() if name not in tied], axis=1)
+        rows = jnp.concatenate([vector[name] for name in self.names])
+        by = jnp.concatenate([of_faces[name] for name in self.names], axis=1)
         of_ties = [(vector[one.prior], along(one.seeds)[one.prior]) for one in structure.tied]
         shape = jax.ShapeDtypeStruct((structure.layout.n,), dtype)
-        solution = jax.pure_callback(self._solve, shape, rows, by, of_ties)
+        solution = jax.pure_callback(functools.partial(_solve, structure), shape, self.faces, rows, by, of_ties)
         return structure.layout.split(solution), lx.RESULTS.successful, {}
-
-    def _solve(self, rows: Array, by: Array, of_ties: list[tuple[Array, Array]]) -> Float[np.ndarray, "n"]:
-        structure, faces, n = self.structure, self.faces, self.structure.layout.n
-        elements, n_shared = structure.elements, structure.layout.n - structure.n
-        rows, by = np.asarray(rows, np.float64), np.asarray(by, np.float64)
-        local = np.take_along_axis(by.T, elements.seeds_of[faces], axis=1)
-        gradient = np.zeros(n)
-        gradient[: elements.n] = times_transposed(elements, local, rows, faces)
-        matrix = structure.arrange(normal_matrix(elements, local, np.ones(len(rows)), faces), n_shared)
-        for tied, (values, along) in zip(structure.tied, of_ties, strict=True):
-            values, along = np.asarray(values, np.float64), np.asarray(along, np.float64)
-            found = _sparse(np.take_along_axis(along.T, tied.seeds_of, axis=1), tied.columns, n)
-            gradient += found.T @ values
-            matrix = matrix.plus(structure.arrange_sparse(sp.csc_array(found.T @ found)))
-        pattern = structure.pattern
-        values = matrix.inner.copy()
-        values[structure.diagonal] += _REGULAR * np.abs(values[structure.diagonal]).max()
-        inner = sp.csc_array((values, pattern.indices, pattern.indptr), shape=(structure.n, structure.n))
-        factor = structure.symbolic.factorise(inner)
-        solved = factor.solve(matrix.border) if n_shared else matrix.border
-        whole = ArrowheadFactor(factor, matrix.border, solved, _inverse(matrix.corner - matrix.border.T @ solved))
-        return whole.solve(gradient).astype(jax.dtypes.canonicalize_dtype(np.float64))
 
     def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         raise NotImplementedError("normal equations have no transpose that a fit would need.")
@@ -532,6 +512,32 @@ class SparseNormal(lx.AbstractLinearSolver):
 
     def assume_full_rank(self) -> bool:
         return True
+
+
+def _solve(
+    structure: Structure, faces: Array, rows: Array, by: Array, of_ties: list[tuple[Array, Array]]
+) -> Float[np.ndarray, "n"]:
+    """Least squares from the derivatives along the seeds."""
+    faces, n = np.asarray(faces), structure.layout.n
+    elements, n_shared = structure.elements, structure.layout.n - structure.n
+    rows, by = np.asarray(rows, np.float64), np.asarray(by, np.float64)
+    local = np.take_along_axis(by.T, elements.seeds_of[faces], axis=1)
+    gradient = np.zeros(n)
+    gradient[: elements.n] = times_transposed(elements, local, rows, faces)
+    matrix = structure.arrange(normal_matrix(elements, local, np.ones(len(rows)), faces), n_shared)
+    for tied, (values, along) in zip(structure.tied, of_ties, strict=True):
+        values, along = np.asarray(values, np.float64), np.asarray(along, np.float64)
+        found = _sparse(np.take_along_axis(along.T, tied.seeds_of, axis=1), tied.columns, n)
+        gradient += found.T @ values
+        matrix = matrix.plus(structure.arrange_sparse(sp.csc_array(found.T @ found)))
+    pattern = structure.pattern
+    values = matrix.inner.copy()
+    values[structure.diagonal] += _REGULAR * np.abs(values[structure.diagonal]).max()
+    inner = sp.csc_array((values, pattern.indices, pattern.indptr), shape=(structure.n, structure.n))
+    factor = structure.symbolic.factorise(inner)
+    solved = factor.solve(matrix.border) if n_shared else matrix.border
+    whole = ArrowheadFactor(factor, matrix.border, solved, _inverse(matrix.corner - matrix.border.T @ solved))
+    return whole.solve(gradient).astype(jax.dtypes.canonicalize_dtype(np.float64))
 
 
 def _sparse(by: Float[np.ndarray, "m d"], columns: Int[np.ndarray, "m d"], n: int) -> sp.csr_array:
@@ -568,4 +574,4 @@ def sparse_solver(model: Model, y: Variables, held: Held) -> SparseNormal:
     """The sparse normal equations of a residual's rows as a linear solver for `optx.GaussNewton`."""
     structure = find_structure(model, y, held.priors, coarse=False)
     faces = np.concatenate([structure.patches.owner[np.asarray(held.faces)], row_faces(model, held.priors)])
-    return SparseNormal(structure, faces)
+    return SparseNormal(structure, faces, ("distance", *(prior.name for prior in model.face_priors)))

@@ -221,11 +221,12 @@ class Family(NamedTuple):
 
 def neighbourhood_mean(topology: js.Topology) -> Average:
     """Averages of a value a face over the faces around each of its corners, the corners counting alike."""
-    parts = [np.asarray(topology.control_faces[size]) for size in (3, 4)]
-    corners = np.concatenate([part.ravel() for part in parts])
+    parts = [topology.control_faces[size] for size in (3, 4)]
+    xp = backend(*parts)
+    corners = xp.concatenate([xp.asarray(part).reshape(-1) for part in parts])
     counts = np.concatenate([np.full(len(part), part.shape[1]) for part in parts])
     face = np.repeat(np.arange(len(counts)), counts)
-    around = np.maximum(np.bincount(corners, minlength=topology.n_control_vertices), 1)
+    around = xp.maximum(_sums(corners, None, topology.n_control_vertices, xp), 1)
 
     def average(values: AnyArray) -> AnyArray:
         xp = jnp if isinstance(values, jax.Array) else np
