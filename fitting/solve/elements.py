@@ -274,6 +274,30 @@ def pair_factors(
     return (3 * patches.slots[at[rows], :, None] + np.arange(3)).reshape(-1, 12), factors
 
 
+def distances_transposed(
+    elements: Elements,
+    patches: Patches,
+    by_surface: Float[Array, "f w d 3"],
+    pairs: Pairs,
+    values: sp.csr_array,
+    at: Int[np.ndarray, "p"],
+) -> Float[np.ndarray, "n k"]:
+    """J' times values of pairs `[p, k]`, J being the derivatives of their distances; see `distance_matrix`."""
+    coordinate, factors = pair_factors(patches, pairs, at, np.arange(len(at)))
+    f, w = patches.vertices.shape
+    place = patches.owner[at][:, None] * (3 * w) + coordinate
+    ends = np.arange(0, factors.size + 1, 12)
+    by_coordinates = sp.csr_array((factors.ravel(), place.ravel(), ends), shape=(len(at), 3 * w * f))
+    sides = (by_coordinates.T @ values).toarray().reshape(f, 3 * w, -1)
+    by = np.asarray(by_surface, np.float64).transpose(0, 1, 3, 2).reshape(f, 3 * w, -1)
+    of_faces = by.transpose(0, 2, 1) @ sides
+    columns = elements.columns.ravel()
+    gather = sp.csr_array(
+        (np.ones(len(columns)), columns, np.arange(len(columns) + 1)), shape=(len(columns), elements.n + 1)
+    )
+    return (gather.T @ of_faces.reshape(len(columns), -1))[:-1]
+
+
 def times_transposed(
     elements: Elements, by: Float[np.ndarray, "m d"], values: Float[np.ndarray, "m"], face: Int[np.ndarray, "m"]
 ) -> Float[np.ndarray, "n"]:

@@ -21,7 +21,7 @@ import jaxsubdiv as js
 
 from ..model.priors import AbstractVertexPrior
 from ..model.priors.shifts import ShiftPrior
-from ..model.residual import Held, Model, Residual
+from ..model.residual import Held, Model, Residual, signed_distances
 from ..model.unknowns import Layout, Unknowns, Variables
 from .cholesky import Factor, Symbolic
 from .cholesky import analyse as analyse_pattern
@@ -32,12 +32,12 @@ from .elements import (
     colour,
     differentiate,
     distance_matrix,
+    distances_transposed,
     find_elements,
     find_patches,
     forgets_some,
     jacobian,
     normal_matrix,
-    pair_factors,
     times_transposed,
 )
 
@@ -246,15 +246,18 @@ def _tie(model: Model, prior: AbstractVertexPrior) -> _Tied:
 @eqx.filter_jit
 def _differentiate_tied(
     model: Model, prior: AbstractVertexPrior, y: Variables, held: Any, seeds: Float[Array | np.ndarray, "s n"]
-) -> Float[Array, "s m"]:
-    """The derivatives of the rows of a prior that ties vertices, along the seeds."""
+) -> tuple[Float[Array, "m"], Float[Array, "s m"]]:
+    """The rows of a prior that ties vertices, and their derivatives along the seeds."""
     dtype, split = y.control.vertices.dtype, model.layout.split
 
     def rows(vector: Float[Array, "n"]) -> Float[Array, "m"]:
         return prior.rows(model.place(model.retract(y, split(vector))), held)
 
-    _, derivative = jax.linearize(rows, jnp.zeros(model.layout.n, dtype))
-    return jax.lax.map(derivative, jnp.asarray(seeds, dtype))
+    found, derivative = jax.linearize(rows, jnp.zeros(model.layout.n, dtype))
+    return found, jax.lax.map(derivative, jnp.asarray(seeds, dtype))
+
+
+_measure_distances = jax.jit(signed_distances)
 
 
 @eqx.filter_jit
@@ -271,15 +274,17 @@ def _evaluate(model: Model, y: Variables, held: Held) -> tuple[dict[str, Array],
 class SparseEquations:
     """Linearised rows about one place on the host: what scan and priors say of the unknowns.
 
-    Rows and gradient are those of the full surface; the matrices may be of a coarser level, see `coarsen`.
+    Rows and gradient are those of the full surface, and the gradient is exact; the matrices may be of a coarser level,
+    see `coarsen`.
     """
 
     def __init__(self, structure: Structure, model: Model, y: Variables, held: Held):
         self.structure, self.model, self.y, self.held = structure, model, y, held
         self._bare = bare = model.bare()
         self._matrix_model = bare if structure.coarse is None else structure.coarse.model
-        rows, gradient = _evaluate(bare, y, held)
-        self.gradient = np.asarray(gradient, np.float64)
+        # Where the matrix has the derivatives of the full surface, they give the gradient too, and save a program.
+        rows, gradient = ({}, np.zeros(model.layout.n)) if structure.coarse is None else _evaluate(bare, y, held)
+        self.gradient = np.array(gradient, np.float64)
         self.values = {name: np.asarray(row, np.float64) for name, row in rows.items()}
         """Rows of each prior, before they are weighed."""
         self._row_faces = row_faces(model, held.priors)
@@ -399,27 +404,24 @@ class SparseEquations:
         if structure.coarse is not None:
             pairs, at = structure.coarse.transfer(pairs, at), at // structure.descendants
         found = structure.arrange(distance_matrix(elements, patches, by_surface, pairs, weights, at), self._n_shared)
+        if structure.coarse is None:
+            self.values["distance"] = np.asarray(_measure_distances(self.found.surface, pairs), np.float64)
+            pulls = sp.csr_array((weights * self.values["distance"])[:, None])
+            self.gradient[: elements.n] += distances_transposed(elements, patches, by_surface, pairs, pulls, at)[:, 0]
         if held.of_points is None:
             return found
         # How the shifts of slices and the other unknowns move distances together: by way of the patches' vertices.
         by_shifts = self._shift_derivatives()
         weighed = sp.csr_array(sp.diags_array(weights) @ by_shifts)
-        coordinate, factors = pair_factors(patches, pairs, at, np.arange(len(at)))
-        f, w = patches.vertices.shape
-        place = patches.owner[at][:, None] * (3 * w) + coordinate
-        ends = np.arange(0, factors.size + 1, 12)
-        by_coordinates = sp.csr_array((factors.ravel(), place.ravel(), ends), shape=(len(at), 3 * w * f))
-        sides = (by_coordinates.T @ weighed).toarray().reshape(f, 3 * w, -1)
-        by = np.asarray(by_surface, np.float64).transpose(0, 1, 3, 2).reshape(f, 3 * w, -1)
-        of_faces = by.transpose(0, 2, 1) @ sides
-        across = np.zeros((elements.n + 1, sides.shape[-1]))
-        np.add.at(across, elements.columns, of_faces)
+        across = distances_transposed(elements, patches, by_surface, pairs, weighed, at)
         columns, n_h = self.model.layout.columns("shifts"), elements.n - n
         shifts = slice(columns.start - n, columns.stop - n)
         found.border[:, shifts] += across[:n]
-        found.corner[:n_h, shifts] += across[n:-1]
-        found.corner[shifts, :n_h] += across[n:-1].T
+        found.corner[:n_h, shifts] += across[n:]
+        found.corner[shifts, :n_h] += across[n:].T
         found.corner[shifts, shifts] += (by_shifts.T @ weighed).toarray()
+        if structure.coarse is None:
+            self.gradient[self.model.layout.columns("shifts")] += weighed.T @ self.values["distance"]
         return found
 
     def _shift_derivatives(self) -> sp.csr_array:
@@ -437,27 +439,33 @@ class SparseEquations:
 
     def _add_face_priors(self) -> Arrowhead:
         elements, held = self.structure.elements, self.held
-        by, first, weights = np.asarray(self.found.by_rows, np.float64), 0, [np.zeros(0)]
+        rows, by = (np.asarray(part, np.float64) for part in (self.found.rows, self.found.by_rows))
+        first, weights = 0, [np.zeros(0)]
         self._rows_of: dict[str, slice] = {}
         for prior in self.model.face_priors:
-            count = len(self.values[prior.name])
+            count = len(prior.faces(held.priors[prior.name]))
             own = slice(first, first + count)
             self._by[prior.name], self._rows_of[prior.name] = by[own], own
+            self.values.setdefault(prior.name, rows[own])
             weights.append(np.broadcast_to(np.asarray(held.precisions[prior.name], np.float64), (count,)))
             first += count
         weights = np.concatenate(weights)
+        if self.structure.coarse is None:
+            self.gradient[: elements.n] += times_transposed(elements, by, weights * rows, self._row_faces)
         return self.structure.arrange(normal_matrix(elements, by, weights, self._row_faces), self._n_shared)
 
     def _add_tied(self, tied: _Tied) -> Arrowhead:
         prior, layout = self._bare.prior(tied.prior), self.model.layout
         assert isinstance(prior, AbstractVertexPrior)
-        by = _differentiate_tied(self._bare, prior, self.y, self.held.priors[prior.name], tied.seeds)
-        by = np.asarray(by, np.float64)
+        rows, by = _differentiate_tied(self._bare, prior, self.y, self.held.priors[prior.name], tied.seeds)
+        rows, by = np.asarray(rows, np.float64), np.asarray(by, np.float64)
         by = np.take_along_axis(by.T, tied.seeds_of, axis=1) if len(by) else np.zeros(tied.columns.shape)
         found = _sparse(by, tied.columns, layout.n)
-        weights = np.asarray(self.held.precisions[prior.name], np.float64)
-        weights = np.broadcast_to(weights, self.values[prior.name].shape)
+        weights = np.broadcast_to(np.asarray(self.held.precisions[prior.name], np.float64), rows.shape)
         self._tied_jacobians[prior.name] = found
+        self.values.setdefault(prior.name, rows)
+        if self.structure.coarse is None:
+            self.gradient += found.T @ (weights * rows)
         return self.structure.arrange_sparse(sp.csc_array(found.T @ sp.csr_array(sp.diags_array(weights) @ found)))
 
 
