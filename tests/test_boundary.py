@@ -16,7 +16,7 @@ from fitting import BoundaryCurve, Free, Priors, Scan, ScanError, boundary_of
 from fitting.model import pairing
 from fitting.model.priors import Place, Start
 from fitting.model.priors.boundary import BoundaryPrior, pair_with_boundary
-from fitting.solve import elements, sparse_normal, sweeps
+from fitting.solve import elements, sweeps
 
 N_POINTS = 400
 
@@ -193,7 +193,7 @@ def test_curve_along_a_part_leaves_the_rest_to_the_scan():
 
 def test_new_pairs_compile_nothing():
     fitted(-2.0, True)
-    programs = elements.differentiate, sparse_normal._evaluate, sweeps.hold_priors, sweeps._apply, pairing.measure
+    programs = elements.differentiate, sweeps.hold_priors, sweeps._retract, pairing.measure
     before = [program._cached._cache_size() for program in programs]
     fit(scan(1.0), BoundaryCurve(square(-0.5, 20.5), 0.3))
     assert [program._cached._cache_size() for program in programs] == before

@@ -192,14 +192,14 @@ def test_cohort_starts_without_faces_upside_down_too():
 def test_step_that_turns_faces_over_is_taken_again_and_shorter(monkeypatch):
     mesh, turned = with_three_neighbours(), []
     start = mesh.vertices + np.random.default_rng(1).normal(scale=(1.5, 1.5, 3), size=mesh.vertices.shape)
-    apply = sweeps._apply
+    retract = sweeps._retract
 
     def watched(*arguments):
-        found = apply(*arguments)
-        turned.append(int(folds(mesh).turned_over(np.asarray(found[0].control.vertices)).sum()))
+        found = retract(*arguments)
+        turned.append(int(folds(mesh).turned_over(np.asarray(found.control.vertices)).sum()))
         return found
 
-    monkeypatch.setattr(sweeps, "_apply", watched)
+    monkeypatch.setattr(sweeps, "_retract", watched)
     rough = {"priors": fitting.Priors(likeness=0.0)}  # the noise of the start's shape is not to be expected
     fit_from(start, **rough)
     with_care = max(turned)

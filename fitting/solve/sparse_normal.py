@@ -261,31 +261,30 @@ _measure_distances = jax.jit(signed_distances)
 
 
 @eqx.filter_jit
-def _evaluate(model: Model, y: Variables, held: Held) -> tuple[dict[str, Array], Float[Array, "n"]]:
-    """The rows at a place, before they are weighed, and the exact gradient of half their weighed squared sum."""
-    layout, residual = model.layout, Residual(model)
-    zero = jnp.zeros(layout.n, y.control.vertices.dtype)
-    rows, pull = jax.vjp(lambda vector: residual.rows(model.retract(y, layout.split(vector)), held), zero)
-    precisions = {"distance": held.distance_precisions} | held.precisions
-    (gradient,) = pull({name: jnp.asarray(precisions[name], row.dtype) * row for name, row in rows.items()})
-    return rows, gradient
+def _pull_distances(model: Model, y: Variables, held: Held) -> tuple[Float[Array, "p"], Float[Array, "n"]]:
+    """The distances at a place, and the exact gradient of half their weighed squared sum: one reverse pass."""
+
+    def measure(vector: Float[Array, "n"]) -> Float[Array, "p"]:
+        moved = model.retract(y, model.layout.split(vector))
+        return Residual(model).distances(model.place(moved, model.refine(moved)), held)
+
+    distances, pull = jax.vjp(measure, jnp.zeros(model.layout.n, y.control.vertices.dtype))
+    return distances, pull(held.distance_precisions.astype(distances.dtype) * distances)[0]
 
 
 class SparseEquations:
     """Linearised rows about one place on the host: what scan and priors say of the unknowns.
 
-    Rows and gradient are those of the full surface, and the gradient is exact; the matrices may be of a coarser level,
-    see `coarsen`.
+    The gradient is exact, that of the full surface; the matrices may be of a coarser level, see `coarsen`. Rows of priors
+    are the same on both.
     """
 
     def __init__(self, structure: Structure, model: Model, y: Variables, held: Held):
         self.structure, self.model, self.y, self.held = structure, model, y, held
         self._bare = bare = model.bare()
         self._matrix_model = bare if structure.coarse is None else structure.coarse.model
-        # Where the matrix has the derivatives of the full surface, they give the gradient too, and save a program.
-        rows, gradient = ({}, np.zeros(model.layout.n)) if structure.coarse is None else _evaluate(bare, y, held)
-        self.gradient = np.array(gradient, np.float64)
-        self.values = {name: np.asarray(row, np.float64) for name, row in rows.items()}
+        self.gradient = np.zeros(model.layout.n)
+        self.values: dict[str, Float[np.ndarray, "m"]] = {}
         """Rows of each prior, before they are weighed."""
         self._row_faces = row_faces(model, held.priors)
         tables = structure.elements.seeds, structure.elements.seeds_of, self._row_faces, structure.patches.vertices
@@ -401,13 +400,16 @@ class SparseEquations:
         structure, held, n = self.structure, self.held, self.structure.n
         elements, patches, by_surface = structure.elements, structure.patches, self.found.by_surface
         weights, pairs, at = np.asarray(held.distance_precisions, np.float64), held.pairs, np.asarray(held.faces)
-        if structure.coarse is not None:
-            pairs, at = structure.coarse.transfer(pairs, at), at // structure.descendants
-        found = structure.arrange(distance_matrix(elements, patches, by_surface, pairs, weights, at), self._n_shared)
-        if structure.coarse is None:
-            self.values["distance"] = np.asarray(_measure_distances(self.found.surface, pairs), np.float64)
-            pulls = sp.csr_array((weights * self.values["distance"])[:, None])
+        if structure.coarse is None:  # these derivatives give the gradient too, and save a program
+            distances = np.asarray(_measure_distances(self.found.surface, pairs), np.float64)
+            pulls = sp.csr_array((weights * distances)[:, None])
             self.gradient[: elements.n] += distances_transposed(elements, patches, by_surface, pairs, pulls, at)[:, 0]
+        else:
+            distances, gradient = (np.asarray(part, np.float64) for part in _pull_distances(self._bare, self.y, held))
+            self.gradient += gradient
+            pairs, at = structure.coarse.transfer(pairs, at), at // structure.descendants
+        self.values["distance"] = distances
+        found = structure.arrange(distance_matrix(elements, patches, by_surface, pairs, weights, at), self._n_shared)
         if held.of_points is None:
             return found
         # How the shifts of slices and the other unknowns move distances together: by way of the patches' vertices.
@@ -446,12 +448,11 @@ class SparseEquations:
             count = len(prior.faces(held.priors[prior.name]))
             own = slice(first, first + count)
             self._by[prior.name], self._rows_of[prior.name] = by[own], own
-            self.values.setdefault(prior.name, rows[own])
+            self.values[prior.name] = rows[own]
             weights.append(np.broadcast_to(np.asarray(held.precisions[prior.name], np.float64), (count,)))
             first += count
         weights = np.concatenate(weights)
-        if self.structure.coarse is None:
-            self.gradient[: elements.n] += times_transposed(elements, by, weights * rows, self._row_faces)
+        self.gradient[: elements.n] += times_transposed(elements, by, weights * rows, self._row_faces)
         return self.structure.arrange(normal_matrix(elements, by, weights, self._row_faces), self._n_shared)
 
     def _add_tied(self, tied: _Tied) -> Arrowhead:
@@ -463,9 +464,8 @@ class SparseEquations:
         found = _sparse(by, tied.columns, layout.n)
         weights = np.broadcast_to(np.asarray(self.held.precisions[prior.name], np.float64), rows.shape)
         self._tied_jacobians[prior.name] = found
-        self.values.setdefault(prior.name, rows)
-        if self.structure.coarse is None:
-            self.gradient += found.T @ (weights * rows)
+        self.values[prior.name] = rows
+        self.gradient += found.T @ (weights * rows)
         return self.structure.arrange_sparse(sp.csc_array(found.T @ sp.csr_array(sp.diags_array(weights) @ found)))
 
 

@@ -124,7 +124,7 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
         self, fn: Any, y: Variables, args: Subject, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> State:
         model, xp = args.model, np if self._on_host else jnp
-        surface, dtype = _refine(model, y), y.control.vertices.dtype
+        surface, dtype = model.refine(y), y.control.vertices.dtype
         unknown = xp.full(self.max_sweeps + 1, np.nan, dtype)
         none = xp.zeros((), dtype)
         strengths = first_strengths(model)
@@ -261,7 +261,9 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
             new_strengths = self.strengths.update(model, y, new_strengths, rows, step, solve_prior, solve, xp)
         else:
             new_strengths = self.strengths.update(model, strengths, xp)
-        proposed, refined, moved = _apply(model, y, jnp.asarray(step, y.control.vertices.dtype), surface)
+        proposed = _retract(model, y, jnp.asarray(step, y.control.vertices.dtype))
+        refined = model.refine(proposed)
+        moved = measure_movement(surface, refined)
         finite = jnp.isfinite(refined.vertices).all()
         new_damping = Damping(next_damping(model, damping, step, loose, state.shifting, xp), step)
         after = State(
@@ -308,11 +310,6 @@ def subject_residual(y: Variables, subject: Subject) -> dict[str, Float[Array, "
     at = search_closest(surface, points)
     look = measure(surface, scene, points, at, model.edge, LEAST_NOISE * model.edge, geman_mcclure())
     return Residual(model)(y, hold_sweep(model, y, scene, look, at, strengths, held, jnp))
-
-
-@eqx.filter_jit
-def _refine(model: Model, y: Variables) -> js.RefinedSurface:
-    return model.refine(y)
 
 
 @eqx.filter_jit
@@ -375,14 +372,11 @@ def hold_sweep(
 
 
 @eqx.filter_jit
-def _apply(
-    model: Model, y: Variables, step: Float[Array, "n"], before: js.RefinedSurface
-) -> tuple[Variables, js.RefinedSurface, Float[Array, ""]]:
-    proposed = model.lasting(model.retract(y, model.layout.split(step)))
-    refined = model.refine(proposed)
-    return proposed, refined, measure_movement(before, refined)
+def _retract(model: Model, y: Variables, step: Float[Array, "n"]) -> Variables:
+    return model.lasting(model.retract(y, model.layout.split(step)))
 
 
+@jax.jit
 def measure_movement(before: js.RefinedSurface, after: js.RefinedSurface) -> Float[Array, ""]:
     """How far a surface moved across itself: nine tenths of its vertices by less than this.
 

@@ -25,7 +25,7 @@ PARTS = {
     "closest points": ["fitting.solve.sweeps.closest_points"],
     "weights, noise": ["fitting.solve.sweeps.measure"],
     "what priors hold": ["fitting.solve.sweeps.hold_priors", "fitting.solve.sweeps.hold_sweep"],
-    "rows and gradient": ["fitting.solve.sparse_normal._evaluate"],
+    "distances and their gradient": ["fitting.solve.sparse_normal._pull_distances"],
     "derivatives": [
         "fitting.solve.sparse_normal.differentiate",
         "fitting.solve.sparse_normal._differentiate_tied",
@@ -36,7 +36,7 @@ PARTS = {
     "strengths by the evidence": ["fitting.solve.sweeps.FromScan.update"],
     "degrees of freedom": ["fitting.solve.sweeps.count_determined"],
     "faces upside down": ["fitting.solve.sweeps.Sweeps._turned_over"],
-    "new surface": ["fitting.solve.sweeps._apply", "fitting.solve.sweeps._refine"],
+    "new surface": ["fitting.solve.sweeps._retract", "fitting.model.residual.Model.refine", "fitting.solve.sweeps.measure_movement"],
     "analysis, once a fit": [
         "fitting.run.fit.analyse",
         "fitting.run.fit.make_scene",
