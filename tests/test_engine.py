@@ -103,9 +103,9 @@ def test_conjugate_gradients_come_to_the_surface_of_the_sparse_equations():
     found = problem().fit(problem().points + noise(), linear_solver="conjugate gradients")
     assert found.result == optx.RESULTS.successful
     on = js.evaluate(noisy().surface, closest_points(noisy().surface, np.asarray(found.surface.vertices))).points
-    # A tenth of the uncertainty, about SIGMA / sqrt(points a control vertex), is where a fit may stop.
-    assert np.linalg.norm(np.asarray(on) - found.surface.vertices, axis=1).max() < 0.02 * SIGMA
-    np.testing.assert_allclose(found.uncertainty().surface, noisy().uncertainty().surface, rtol=0.02)
+    assert np.linalg.norm(np.asarray(on) - found.surface.vertices, axis=1).max() < 1e-4 * SIGMA
+    # The misfit counts points face by face, and the closest point of an edge may lie on either face.
+    np.testing.assert_allclose(found.uncertainty().control, noisy().uncertainty().control, rtol=1e-4)
 
 
 # Other solvers

@@ -149,6 +149,8 @@ def test_vectors_of_unknowns_go_to_offsets_and_back(free):
 class Bends:
     """Rows that are the unknowns themselves."""
 
+    model, values = None, None
+
     def times(self, name, x):
         return x
 

@@ -222,15 +222,19 @@ def test_as_many_points_make_a_measurement_as_share_their_errors():
     np.testing.assert_allclose(strokes.most, 8 / (40 * np.sin(np.pi / 400)), rtol=1e-3)
     np.testing.assert_array_equal(slices[strokes.nearest], slices)
     one, r = np.ones(1200), 0.8
-    assert 1 <= strokes.points_a_measurement(rng.normal(size=1200), one) < 1.2
+
+    def count(distances, weights):
+        return float(strokes.count_points_a_measurement(jnp.asarray(distances), jnp.asarray(weights)))
+
+    assert 1 <= count(rng.normal(size=1200), one) < 1.2
     shared = rng.normal(size=1200)
     for i in range(1, 1200):
         shared[i] = r * shared[i - 1] + (1 - r**2) ** 0.5 * shared[i]
-    np.testing.assert_allclose(strokes.points_a_measurement(shared, one), (1 + r) / (1 - r), rtol=0.2)
-    assert strokes.points_a_measurement(one, one) == strokes.most  # a surface that is off
+    np.testing.assert_allclose(count(shared, one), (1 + r) / (1 - r), rtol=0.2)
+    assert count(one, one) == strokes.most  # a surface that is off
     half = np.where(slices == 4, 0.0, 1.0)  # what does not count has no say
     far = np.where(slices == 4, 100.0, rng.normal(size=1200))
-    assert strokes.points_a_measurement(far, half) < 1.2 and strokes.points_a_measurement(0 * one, one) == 1
+    assert count(far, half) < 1.2 and count(0 * one, one) == 1
     assert find_strokes(Scan(points)) is None and find_strokes(Scan(points, slices=0 * slices)) is None
 
 

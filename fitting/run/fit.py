@@ -39,7 +39,8 @@ from .checkpoint import Checkpoint
 
 LinearSolver: TypeAlias = Literal["sparse", "conjugate gradients"]
 
-_TIGHT, _MOST_STEPS = 1e-4, 1000  # of conjugate gradients, where one fit is to come to the host's surface
+# Of conjugate gradients, where one fit is to come to the host's surface: of the gradient, or as near as its precision.
+_TIGHT, _ROUNDING, _MOST_STEPS = 1e-6, 1e3, 1000
 # A start that is off by more than this part of the control mesh's size is not roughly aligned.
 _FAR = 0.05
 # Scans in metres against a mesh in mm differ by 1000; a partial scan of the anatomy by much less than this.
@@ -194,7 +195,8 @@ def make_solver(
         held, _ = hold_priors(model, y, model.refine(y), first_strengths(model).values, scene)
         solver = SparseNormal(find_structure(model, y, held))
     else:
-        solver = ConjugateGradients(_TIGHT, _MOST_STEPS)
+        eps = float(jnp.finfo(y.control.vertices.dtype).eps)
+        solver = ConjugateGradients(max(_TIGHT, _ROUNDING * eps), _MOST_STEPS)
     tables = Folds(model.topology)
     return Sweeps(solver, FromScan(), loss, tolerance, max_sweeps, tables)
 
