@@ -8,6 +8,7 @@ import jaxtyping
 import pytest
 
 jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_disable_most_optimizations", True)  # programs that run a few times take longer to be made fast
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jaxtyping.install_import_hook(["jaxsubdiv", "fitting"], "beartype.beartype")  # before anything imports them
