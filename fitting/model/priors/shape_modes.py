@@ -17,6 +17,7 @@ from ..unknowns import AnyArray, Shared
 from .base import AbstractVertexPrior, Place, Start, backend
 
 _FIRST = 0.1  # of a control edge: standard deviation of what the modes leave, in the first sweep
+_LEAST = 0.05  # of the widest mode: the rest of a family that has no more modes than it shows
 
 
 class ShapeModes(eqx.Module):
@@ -26,8 +27,9 @@ class ShapeModes(eqx.Module):
         mean: mean control vertices in mm.
         modes: directions of variation, each of length 1 over all coordinates.
         deviations: standard deviation of the family along each, in mm over all coordinates.
-        rest: standard deviation in mm, in each coordinate of a control vertex, of what a member has beside the modes;
-            None, the default, where it is found from the scan.
+        rest: standard deviation in mm, in each coordinate of a control vertex, of what a member has beside the modes.
+            Of `Modes`: what each member of the family has beside the modes of the others. None, the default: found from
+            the scan, which often says too little of it and leaves the scores little to say.
     """
 
     mean: Float[Array, "v 3"] = eqx.field(converter=jnp.asarray)
@@ -50,11 +52,25 @@ class ShapeModes(eqx.Module):
 
     @staticmethod
     def of(value: "ShapeModes | Modes | None") -> "ShapeModes | None":
-        """From what `shape_modes` found: those modes that the family varies along."""
+        """From what `shape_modes` found: those modes that the family varies along, and as the rest what each member has
+        beside the modes of the others."""
         if not isinstance(value, Modes):
             return value
         some = value.deviations > 1e-6 * value.deviations.max()
-        return ShapeModes(value.mean, value.modes[some], value.deviations[some])
+        rest = max(_beside_others(value.aligned), _LEAST * float(np.max(value.deviations)) / len(value.mean) ** 0.5)
+        return ShapeModes(value.mean, value.modes[some], value.deviations[some], rest)
+
+
+def _beside_others(shapes: Float[np.ndarray, "s v 3"]) -> float:
+    """How far shapes lie beside the modes of the other shapes, root mean square in each coordinate, in mm."""
+    squares = []
+    for i, own in enumerate(shapes):
+        others = np.delete(shapes, i, axis=0)
+        mean = others.mean(axis=0)
+        _, widths, modes = np.linalg.svd((others - mean).reshape(len(others), -1), full_matrices=False)
+        modes, away = modes[widths > 1e-9 * widths.max(initial=0)], (own - mean).ravel()
+        squares.append(np.mean((away - modes.T @ (modes @ away)) ** 2))
+    return float(np.sqrt(np.mean(squares)))
 
 
 class _Held(NamedTuple):
