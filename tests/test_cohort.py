@@ -71,10 +71,11 @@ def surface(found: fitting.Cohort, i: int) -> js.RefinedSurface:
 
 
 def test_every_fit_is_as_one_of_its_own():
-    found = cohort()
+    found, topology = cohort(), scans.problem().topology
     assert found.converged.all() and len(found) == N_SUBJECTS
+    options = {"priors": PRIORS, "tolerance": 0.01, "throw": False}
     for i, scan in enumerate(subjects()[:2]):
-        single = fitting.fit(js.Interpolating(), scans.problem().topology, start(), scan, priors=PRIORS, tolerance=0.01, throw=False)
+        single = fitting.fit(js.Interpolating(), topology, start(), scan, **options)
         of_single, of_cohort = off(truths()[i], single.surface), off(truths()[i], surface(found, i))
         assert of_cohort < 1.1 * of_single + 0.01
         assert off(single.surface, surface(found, i)) < 0.3 * of_single

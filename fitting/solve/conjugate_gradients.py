@@ -89,7 +89,7 @@ class ConjugateGradients(lx.AbstractLinearSolver):
 
 
 class OperatorEquations:
-    """Linearised rows about one place, as products with their derivatives; the same as `SparseEquations` on the host."""
+    """Linearised rows about one place, as products with their derivatives; `SparseEquations` is the host's."""
 
     def __init__(self, solver: ConjugateGradients, model: Model, y: Variables, held: Held):
         self._solver, self.model, self._held = solver, model, held

@@ -1,4 +1,4 @@
-"""Normal equations of a sweep on the host: sparse in the unknowns of control vertices, bordered by those that are shared.
+"""Normal equations of a sweep on the host: sparse in the unknowns of control vertices, bordered by shared ones.
 
 The matrix is an arrowhead, [A B; B' C]. A couples the unknowns of control vertices that lie near each other, C those
 that all rows share, as h, shifts of slices or scores of shape modes, and B both. One analysis serves all sweeps.
@@ -275,8 +275,8 @@ def _pull_distances(model: Model, y: Variables, held: Held) -> tuple[Float[Array
 class SparseEquations:
     """Linearised rows about one place on the host: what scan and priors say of the unknowns.
 
-    The gradient is exact, that of the full surface; the matrices may be of a coarser level, see `coarsen`. Rows of priors
-    are the same on both.
+    The gradient is exact, that of the full surface; the matrices may be of a coarser level, see `coarsen`, on which the
+    rows of priors are the same.
     """
 
     def __init__(self, structure: Structure, model: Model, y: Variables, held: Held):
@@ -568,7 +568,7 @@ def _keys(pattern: sp.csc_array) -> Int[np.ndarray, "e"]:
 
 
 def _inverse(matrix: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
-    """The inverse of a small symmetric matrix; what has no curvature, as the plane of a mesh that is one point, stays."""
+    """The inverse of a small symmetric matrix; what has no curvature (the plane of a mesh that is one point) stays."""
     if not len(matrix):
         return matrix
     scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(matrix)), np.finfo(float).tiny))

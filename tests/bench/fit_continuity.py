@@ -3,7 +3,7 @@
     python tests/bench/fit_continuity.py                      # the two examples that ship
     python tests/bench/fit_continuity.py base head_fragment   # the protocol's base case needs the extra `bench`
 
-Prints a Markdown table. Every fit runs in a process of its own, because precision and threads are settings of a process.
+Prints a Markdown table. Every fit runs in a process of its own: precision and threads are settings of a process.
 The surface's change is measured across itself, over the median standard deviation that the first fit reports; that of
 control vertices over a control edge.
 """
@@ -111,7 +111,7 @@ def main() -> None:
         fit_once(given.cases[0], given.change, given.output)
         return
     print(
-        "| case | change | sweeps | RMS, mm | surface, 95 %, / sd | at most | control vertices, 95 %, / edge | at most |"
+        "| case | change | sweeps | RMS, mm | surface, 95 % / sd | at most | control vertices, 95 % / edge | at most |"
     )
     print("| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |")
     with tempfile.TemporaryDirectory() as folder:

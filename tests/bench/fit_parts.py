@@ -36,7 +36,7 @@ PARTS = {
     "strengths by the evidence": ["fitting.solve.sweeps.FromScan.update"],
     "degrees of freedom": ["fitting.solve.sweeps.count_determined"],
     "faces upside down": ["fitting.solve.sweeps.Sweeps._turned_over"],
-    "new surface": ["fitting.solve.sweeps._retract", "fitting.model.residual.Model.refine", "fitting.solve.sweeps.measure_movement"],
+    "new surface": [f"fitting.solve.sweeps.{name}" for name in ("_retract", "Model.refine", "measure_movement")],
     "analysis, once a fit": [
         "fitting.run.fit.analyse",
         "fitting.run.fit.make_scene",

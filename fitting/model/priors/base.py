@@ -134,7 +134,7 @@ class AbstractFacePrior(AbstractPrior):
 
 
 class AbstractVertexPrior(AbstractPrior):
-    """A prior each of whose rows depends on few control vertices anywhere, and on shared unknowns; not on the surface."""
+    """A prior whose rows each depend on few control vertices anywhere, and on shared unknowns; not on the surface."""
 
     uses: ClassVar[tuple[str, ...]] = ()
     """Names of the shared unknowns that its rows depend on."""

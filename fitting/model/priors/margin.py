@@ -19,7 +19,7 @@ _MARGIN, _SOFTNESS, _SPREAD = 0.2, 0.1, 0.02
 
 
 class Margin(AbstractFacePrior):
-    """The cosine between a control normal and each face at its vertex stays above a margin; see `js.admissible_margin`."""
+    """The cosine between a control normal and each face at its vertex is above a margin; see `js.admissible_margin`."""
 
     name: ClassVar[str] = "margin"
     n_triangles: int = eqx.field(static=True)

@@ -1,4 +1,4 @@
-"""Shapes seen before: the control mesh is a mean shape, moved along its modes of variation, and something of its own."""
+"""Shapes seen before: the control mesh is a mean shape, moved along modes of variation, and something of its own."""
 
 import dataclasses
 from typing import Any, ClassVar, NamedTuple
@@ -151,7 +151,7 @@ class ShapePrior(AbstractVertexPrior):
         shape = self.mean + jnp.tensordot(scores, self.modes, 1)
         there = align_shape(shape, vertices, jnp, scale=False)
         middle = there.mean(axis=0)
-        # A rigid motion of the shape turns each mode as a vector: by the motion of the shape with it, less that without.
+        # A rigid motion of the shape turns each mode as a vector: by the moved shape with it, less that without.
         a, b = shape - shape.mean(axis=0)[None], there - middle[None]
         u, _, vt = jnp.linalg.svd(b.T @ a)
         turn = u @ vt
