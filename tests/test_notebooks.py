@@ -1,6 +1,7 @@
-"""Every notebook runs from top to bottom as plain Python, and is kept without outputs."""
+"""Every notebook runs from top to bottom as plain Python, and is kept without outputs; and so do the pages."""
 
 import json
+import re
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -31,3 +32,11 @@ def test_runs_from_top_to_bottom(path, monkeypatch, tmp_path):
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_is_kept_without_outputs(path):
     assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in _code_cells(path))
+
+
+def test_examples_of_how_a_fit_works_run():
+    text = (Path(__file__).parents[1] / "docs" / "how_a_fit_works.md").read_text(encoding="utf-8")
+    names: dict = {"__name__": "page"}
+    for number, block in enumerate(re.findall(r"```python\n(.*?)```", text, re.DOTALL), start=1):
+        exec(compile(block, f"how_a_fit_works.md, example {number}", "exec"), names)
+    assert names["control"].vertices.shape == names["template"].vertices.shape

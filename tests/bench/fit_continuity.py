@@ -71,7 +71,7 @@ def read_base():
     import jaxsubdiv as js
 
     case = fit_protocol.CASES["base"]
-    problem, _ = fit_protocol.draw(fit_protocol.read_truth(case), case, 0)
+    problem, _ = fit_protocol.draw(fit_protocol.true_surface(fit_protocol.DATA / case.truth), case, 0)
     template = problem.template(problem.n_vertices)
     return problem.scan, js.ControlMesh(template.vertices, template.faces, template.vertex_normals)
 
