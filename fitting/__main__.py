@@ -88,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _recipe(options: argparse.Namespace) -> Recipe:
     """The settings: those of a recipe, or the defaults, and before them what was given beside it."""
     recipe = Recipe(js.Interpolating()) if options.recipe is None else load_recipe(options.recipe)
-    scheme = recipe.scheme if options.scheme is None else SCHEMES[options.scheme]()
+    scheme = recipe.scheme if options.scheme is None else SCHEMES[options.scheme]()  # pyright: ignore[reportCallIssue]
     if options.h is not None:
         if scheme.h is None:
             raise ValueError(f"the scheme {type(scheme).__name__} has no h: leave --h out.")

@@ -100,7 +100,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _scheme(options: argparse.Namespace) -> AbstractScheme:
     kind = _compare.SCHEMES[options.scheme]
-    default = kind()
+    default = kind()  # pyright: ignore[reportCallIssue]
     names = ("twist", "weights", "old_normals", "boundary")
     chosen = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     if chosen and not isinstance(default, Interpolating):

@@ -55,7 +55,7 @@ def compare(mesh: ControlMesh, truth: ControlMesh, levels: int) -> tuple[list[Ro
     true_normals /= np.linalg.norm(true_normals, axis=1, keepdims=True)
     rows, left_out = [], []
     for name, kind in SCHEMES.items():
-        scheme = kind()
+        scheme = kind()  # pyright: ignore[reportCallIssue]
         if 3 not in scheme.takes and len(mesh.faces[3]):
             left_out.append(f"{name} takes quads only")
             continue

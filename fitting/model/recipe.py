@@ -21,7 +21,7 @@ _VERSION = 2  # 1 had no settings of `fit_scan`, which then are the defaults
 _SCHEMES = {kind.__name__: kind for kind in js.SCHEMES.values()}
 _LOSSES = {kind.__name__: kind for kind in (Barron, Huber, LeastSquares, Tukey)}
 _M = TypeVar("_M", bound=eqx.Module)
-_S = TypeVar("_S")
+_S = TypeVar("_S", bound="Settings")
 
 
 @dataclasses.dataclass(frozen=True)

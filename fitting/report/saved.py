@@ -193,7 +193,9 @@ def _restore(arrays: dict[str, np.ndarray]) -> Fit:
         inputs["alike"] = alike
         model, first = analyse(*of_fit, inputs)
     if int(arrays["version"]) == 3 and "shifts" in first.shared:
-        arrays["shared_shifts"] = _shifts_within(arrays, inputs["slices"])
+        planes = inputs["slices"]
+        assert planes is not None
+        arrays["shared_shifts"] = _shifts_within(arrays, planes)
     shared = {name: on_device(f"shared_{name}") for name in first.shared}
     for name, value in shared.items():
         if value.shape != (usual := first.shared[name]).shape:

@@ -142,12 +142,12 @@ def fit_cohort(
     ]
     subjects += subjects[-1:] * (-n % at_once)
     solver = Sweeps(
-        ConjugateGradients(_SOLVED, _MOST_STEPS),
-        find_targets(models[0], priors, pilot),
-        loss,
-        jnp.asarray(tolerance, controls[0].vertices.dtype),
-        max_sweeps,
-        Folds(topology),
+        linear_solver=ConjugateGradients(_SOLVED, _MOST_STEPS),
+        strengths=find_targets(models[0], priors, pilot),
+        loss=loss,
+        rtol=jnp.asarray(tolerance, controls[0].vertices.dtype),
+        max_sweeps=max_sweeps,
+        folds=Folds(topology),
     )
     shared, own = _split_common(subjects)
     values, states = jax.tree.map(lambda rows: rows[:n], _run(solver, shared, own, at_once))
@@ -243,8 +243,8 @@ def _fill_up(inputs: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def _fill_landmarks(own: dict[str, Any], size: int) -> None:
     anchors = own["landmarks"]
     more = size - len(anchors.points)
-    rows = [jnp.concatenate([part, jnp.repeat(part[-1:], more, axis=0)]) for part in anchors]
-    own["landmarks"] = Anchors(*rows[:-1], rows[-1].at[size - more :].set(jnp.inf))
+    filled = Anchors(*(jnp.concatenate([part, jnp.repeat(part[-1:], more, axis=0)]) for part in anchors))
+    own["landmarks"] = filled._replace(deviations=filled.deviations.at[size - more :].set(jnp.inf))
 
 
 def _fill_curve(own: dict[str, Any], size: int) -> None:

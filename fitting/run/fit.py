@@ -197,8 +197,14 @@ def make_solver(
     else:
         eps = float(jnp.finfo(y.control.vertices.dtype).eps)
         solver = ConjugateGradients(max(_TIGHT, _ROUNDING * eps), _MOST_STEPS)
-    tables = Folds(model.topology)
-    return Sweeps(solver, FromScan(), loss, tolerance, max_sweeps, tables)
+    return Sweeps(
+        linear_solver=solver,
+        strengths=FromScan(),
+        loss=loss,
+        rtol=tolerance,
+        max_sweeps=max_sweeps,
+        folds=Folds(model.topology),
+    )
 
 
 def gather_inputs(
@@ -242,7 +248,7 @@ def record_fit(
         scene=scene,
         look=state.look,
         strengths=state.strengths,
-        hold=state.damping.hold,
+        hold=np.asarray(state.damping.hold),
         shifting=bool(state.shifting),
         scan=scan,
         start=start,

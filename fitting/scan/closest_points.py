@@ -123,7 +123,7 @@ class _Search:
     def usual_distance(self) -> float:
         """How far most points are from the surface at most, by a few of them."""
         rows = _some(np.arange(len(self._rows)))
-        distances = self._bounds_by(rows, self._tree.query(self._rows[rows])[1])
+        distances = self._bounds_by(rows, np.asarray(self._tree.query(self._rows[rows])[1]))
         most, half = np.quantile(distances, (0.85, 0.5))
         return float(np.clip(1.5 * most, 0.02 * self._reach, max(2 * self._reach, 1.5 * half)))  # not for outliers
 

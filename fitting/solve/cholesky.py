@@ -306,7 +306,7 @@ def _joined(arrays: list[np.ndarray]) -> Int[np.ndarray, " n"]:
     return np.concatenate([np.empty(0, int), *arrays])
 
 
-def _keys(indptr: Int[np.ndarray, " n+1"], indices: Int[np.ndarray, " e"]) -> Int[np.ndarray, " e"]:
+def _keys(indptr: Int[np.ndarray, " _"], indices: Int[np.ndarray, " e"]) -> Int[np.ndarray, " e"]:
     """A number for each entry of a pattern, ascending if the columns are sorted."""
     n = len(indptr) - 1
     return np.repeat(np.arange(n), np.diff(indptr)) * n + indices

@@ -51,9 +51,10 @@ def coarsen(model: Model) -> Coarse | None:
     coarser = js.build_topology(bare, scheme, _LEVELS)
     fine, coarse = _corners(topology), _corners(coarser)
     ancestor = np.arange(len(fine)) // 4 ** (n_levels - _LEVELS)
-    midpoints = _midpoint_weights(topology, coarse.max() + 1)
-    keys = np.repeat(np.arange(midpoints.shape[0]), np.diff(midpoints.indptr)) * midpoints.shape[1] + midpoints.indices
-    wanted = fine[:, :, None] * midpoints.shape[1] + coarse[ancestor][:, None, :]
+    n = int(coarse.max()) + 1
+    midpoints = _midpoint_weights(topology, n)
+    keys = np.repeat(np.arange(len(midpoints.indptr) - 1), np.diff(midpoints.indptr)) * n + midpoints.indices
+    wanted = fine[:, :, None] * n + coarse[ancestor][:, None, :]
     place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
     weights = np.where(keys[place] == wanted, midpoints.data[place], 0.0)
     is_triangle = coarse[ancestor, 3] == coarse[ancestor, 2]
@@ -69,14 +70,14 @@ def _corners(topology: js.Topology) -> Int[np.ndarray, "g 4"]:
 def _midpoint_weights(topology: js.Topology, n: int) -> sp.csr_array:
     """Weights of all vertices over the `n` of the coarser level: edge vertices in the middle of their edges, face
     vertices in the middle of their quads."""
-    whole = sp.eye_array(n, format="csr")
+    whole = sp.csr_array(sp.eye_array(n, format="csr"))
     for level in topology.levels[_LEVELS:]:
         edges, quads = np.asarray(level.edges), np.asarray(level.quads)  # pyright: ignore[reportAttributeAccessIssue]
         parts = [whole]
         for ends in (edges, quads):
             rows = np.repeat(np.arange(len(ends)), ends.shape[1])
             mean = sp.csr_array(
-                (np.full(ends.size, 1 / ends.shape[1]), (rows, ends.ravel())), shape=(len(ends), whole.shape[0])
+                (np.full(ends.size, 1 / ends.shape[1]), (rows, ends.ravel())), shape=(len(ends), len(whole.indptr) - 1)
             )
             parts.append(mean @ whole)
         whole = sp.csr_array(sp.vstack(parts, format="csr"))

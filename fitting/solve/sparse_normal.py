@@ -125,7 +125,7 @@ class Structure:
     @property
     def n(self) -> int:
         """Number of unknowns of A."""
-        return self.pattern.shape[0]
+        return self.layout.n_own
 
     @property
     def corners(self) -> Int[np.ndarray, "g 4"]:
@@ -186,7 +186,7 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any], *, coarse: 
         )
     layout, n = model.layout, model.layout.n_own
     tied = [_tie(model, prior) for prior in model.vertex_priors]
-    pattern = sp.csc_array(abs(elements.pattern.astype(float)[:n, :n])) + sp.eye_array(n, format="csc")
+    pattern = sp.csc_array(abs(sp.csc_array(elements.pattern.astype(float))[:n, :n])) + sp.eye_array(n, format="csc")
     pattern.data[:] = 1
     for one in tied:
         by = _sparse(np.ones(one.columns.shape), one.columns, layout.n)
@@ -303,9 +303,9 @@ class SparseEquations:
         if name in self._tied_jacobians:
             by = self._tied_jacobians[name]
         else:
-            rows = self._rows_of[name]
-            by = jacobian(self.structure.elements, self._by[name], self._row_faces[rows])
-            by = sp.csr_array((by.data, by.indices, by.indptr), shape=(by.shape[0], n))
+            faces = self._row_faces[self._rows_of[name]]
+            by = jacobian(self.structure.elements, self._by[name], faces)
+            by = sp.csr_array((by.data, by.indices, by.indptr), shape=(len(faces), n))
         return by if np.all(self.model.is_free) else sp.csr_array(by @ sp.diags_array(np.asarray(self.model.is_free)))
 
     def times(self, name: str, x: Float[np.ndarray, "n s"]) -> Float[np.ndarray, "m s"]:
@@ -526,13 +526,13 @@ def _solve(
     structure: Structure, faces: Array, rows: Array, by: Array, of_ties: list[tuple[Array, Array]]
 ) -> Float[np.ndarray, "n"]:
     """Least squares from the derivatives along the seeds."""
-    faces, n = np.asarray(faces), structure.layout.n
+    face, n = np.asarray(faces), structure.layout.n
     elements, n_shared = structure.elements, structure.layout.n - structure.n
-    rows, by = np.asarray(rows, np.float64), np.asarray(by, np.float64)
-    local = np.take_along_axis(by.T, elements.seeds_of[faces], axis=1)
+    left, slopes = np.asarray(rows, np.float64), np.asarray(by, np.float64)
+    local = np.take_along_axis(slopes.T, elements.seeds_of[face], axis=1)
     gradient = np.zeros(n)
-    gradient[: elements.n] = times_transposed(elements, local, rows, faces)
-    matrix = structure.arrange(normal_matrix(elements, local, np.ones(len(rows)), faces), n_shared)
+    gradient[: elements.n] = times_transposed(elements, local, left, face)
+    matrix = structure.arrange(normal_matrix(elements, local, np.ones(len(left)), face), n_shared)
     for tied, (values, along) in zip(structure.tied, of_ties, strict=True):
         values, along = np.asarray(values, np.float64), np.asarray(along, np.float64)
         found = _sparse(np.take_along_axis(along.T, tied.seeds_of, axis=1), tied.columns, n)
@@ -559,12 +559,12 @@ def _sparse(by: Float[np.ndarray, "m d"], columns: Int[np.ndarray, "m d"], n: in
 
 def _columns(pattern: sp.csc_array) -> Int[np.ndarray, "e"]:
     """The column of every entry."""
-    return np.repeat(np.arange(pattern.shape[1]), np.diff(pattern.indptr))
+    return np.repeat(np.arange(len(pattern.indptr) - 1), np.diff(pattern.indptr))
 
 
 def _keys(pattern: sp.csc_array) -> Int[np.ndarray, "e"]:
     """A number for every entry, by column and row."""
-    return _columns(pattern).astype(np.int64) * pattern.shape[0] + pattern.indices
+    return _columns(pattern).astype(np.int64) * pattern.shape[0] + pattern.indices  # pyright: ignore[reportOptionalSubscript]
 
 
 def _inverse(matrix: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:

@@ -241,8 +241,8 @@ def _sums(index: AnyArray, values: AnyArray | None, n: int, xp: Any) -> AnyArray
     if xp is np:
         kept = index >= 0
         return np.bincount(index[kept], None if values is None else values[kept], n)
-    values = jnp.ones(len(index)) if values is None else values
-    return jax.ops.segment_sum(jnp.where(jnp.asarray(index) >= 0, values, 0), jnp.maximum(jnp.asarray(index), 0), n)
+    summed = jnp.ones(len(index)) if values is None else values
+    return jax.ops.segment_sum(jnp.where(jnp.asarray(index) >= 0, summed, 0), jnp.maximum(jnp.asarray(index), 0), n)
 
 
 def next_precisions(

@@ -10,9 +10,9 @@ scan given the surface, times that of the surface.
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 import jaxsubdiv as js
@@ -22,7 +22,7 @@ from ..unknowns import AnyArray, Shared
 
 def backend(*values: Any) -> Any:
     """numpy for values that are known, jax.numpy while a program is traced."""
-    return jnp if any(isinstance(value, jax.core.Tracer) for value in values) else np
+    return jnp if any(isinstance(value, Tracer) for value in values) else np
 
 
 class Place(NamedTuple):
@@ -72,7 +72,7 @@ class AbstractPrior(eqx.Module):
     A prior is made by `make(priors, start)`, from the settings `Priors` and what the scan brings; None leaves it out.
     """
 
-    name: eqx.AbstractClassVar[str]
+    name: ClassVar[str]
 
     @classmethod
     def make(cls, priors: Any, start: Start) -> "AbstractPrior | None":

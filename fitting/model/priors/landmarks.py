@@ -36,7 +36,7 @@ class LandmarkPrior(AbstractFacePrior):
 
     @classmethod
     def make(cls, priors: Any, start: Start) -> "LandmarkPrior | None":
-        anchors = start.inputs.get("landmarks")
+        anchors: Anchors | None = start.inputs.get("landmarks")
         if anchors is None:
             return None
         return cls(*anchors, start.owner[np.asarray(anchors.face)])
