@@ -2,7 +2,6 @@
 
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.spatial import KDTree
 
 from ._control import Control
 from ._scheme.base import AbstractScheme
@@ -43,6 +42,8 @@ def control_faces_of(
 
     def centres(vertices: Array, faces: dict) -> Float[np.ndarray, "f 3"]:
         return np.concatenate([np.asarray(vertices)[np.asarray(faces[size])].mean(axis=1) for size in (3, 4)])
+
+    from scipy.spatial import KDTree  # here and not above: refining never needs it
 
     tree = KDTree(centres(control.vertices, topology.control_faces))
     return np.asarray(tree.query(centres(surface.vertices, surface.faces))[1])

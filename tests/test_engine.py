@@ -24,6 +24,7 @@ from fitting import (
     Sweeps,
     closest_points,
     find_symmetry,
+    search_closest,
     sparse_solver,
 )
 from fitting.model.pairing import make_scene
@@ -75,10 +76,16 @@ def test_one_sweep_goes_where_it_always_went(name, monkeypatch):
 
 @functools.cache
 def noisy() -> fitting.FitResult:
-    return problem().fit(problem().points + noise(), tolerance=0.01)
+    return problem().fit(problem().points + noise())
 
 
-def test_sweeps_are_a_solver_that_runs_as_one_program():
+@pytest.fixture
+def search_of_the_device(monkeypatch):
+    """One search for both linear solvers: of two triangles that are equally near, each search may take another."""
+    monkeypatch.setattr(sweeps, "closest_points", eqx.filter_jit(search_closest))
+
+
+def test_sweeps_are_a_solver_that_runs_as_one_program(search_of_the_device):
     p, loss, n_sweeps = problem(), fitting.geman_mcclure(), 3
     control = sound_start(js.Interpolating(), p.topology, p.start, Free())
     model, y = analysed(js.Interpolating(), p.topology, control)
@@ -99,20 +106,23 @@ def test_sweeps_are_a_solver_that_runs_as_one_program():
         np.testing.assert_allclose(state.strengths.values[name], expected.fit.strengths.values[name], rtol=1e-4)
 
 
-def test_conjugate_gradients_come_to_the_surface_of_the_sparse_equations():
-    found = problem().fit(problem().points + noise(), linear_solver="conjugate gradients")
+def test_conjugate_gradients_come_to_the_surface_of_the_sparse_equations(search_of_the_device):
+    found, expected = (
+        problem().fit(problem().points + noise(), linear_solver=solver) for solver in ("conjugate gradients", "sparse")
+    )
     assert found.result == optx.RESULTS.successful
-    on = js.evaluate(noisy().surface, closest_points(noisy().surface, np.asarray(found.surface.vertices))).points
-    assert np.linalg.norm(np.asarray(on) - found.surface.vertices, axis=1).max() < 1e-4 * SIGMA
+    on = js.evaluate(expected.surface, closest_points(expected.surface, np.asarray(found.surface.vertices))).points
+    assert np.linalg.norm(np.asarray(on) - found.surface.vertices, axis=1).max() < 1e-3 * SIGMA
     # The misfit counts points face by face, and the closest point of an edge may lie on either face.
-    np.testing.assert_allclose(found.uncertainty().control, noisy().uncertainty().control, rtol=1e-4)
+    np.testing.assert_allclose(found.uncertainty().control, expected.uncertainty().control, rtol=1e-4)
 
 
 # Other solvers
 
 
 def test_rows_of_a_fit_are_for_any_solver_of_least_squares():
-    fit, model = noisy().fit, noisy().fit.model
+    fit = problem().fit(problem().points + noise(), tolerance=0.01).fit  # at rest, as the others will be
+    model = fit.model
     held, of_offsets = fit.held(), Residual(model).about(fit.y)
     solvers = {
         "Levenberg-Marquardt": optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9),

@@ -27,7 +27,7 @@ _NEIGHBOURS = 9
 _CLEAN = 0.9  # of the points crowded: so few outliers that neighbours can be trusted
 _STEEPEST = 0.5  # height over length: by how much the anatomy may turn away beyond a boundary
 _ON_SURFACE = 1e-6  # in control edges: the same, where there is no noise and at open boundaries
-_NEAR = 3.0  # times the noise: distances of closer points count along the surface's normal
+_NEAR = 0.3  # times the noise: distances of closer points count along the surface's normal
 _LEAST_COSINE = 0.5  # between a scan's normal and the surface's: beyond 60 degrees it is the other side of something
 
 

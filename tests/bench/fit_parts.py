@@ -25,10 +25,10 @@ PARTS = {
     "closest points": ["fitting.solve.sweeps.closest_points"],
     "weights, noise": ["fitting.solve.sweeps.measure"],
     "what priors hold": ["fitting.solve.sweeps.hold_priors", "fitting.solve.sweeps.hold_sweep"],
-    "distances and their gradient": ["fitting.solve.sparse_normal._pull_distances"],
     "derivatives": [
         "fitting.solve.sparse_normal.differentiate",
         "fitting.solve.sparse_normal._differentiate_tied",
+        "fitting.solve.sparse_normal._pull_distances",
     ],
     "normal equations": ["fitting.solve.sweeps.SparseNormal.linearise"],
     "factorisation": ["fitting.solve.sparse_normal.SparseEquations.factorise"],
