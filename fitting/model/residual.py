@@ -179,6 +179,7 @@ class OffsetResidual(eqx.Module):
 
 def signed_distances(vertices: Float[Array, "v 3"], pairs: Pairs) -> Float[Array, "p"]:
     """How far the surface points lie from their scan points, along the directions held fixed."""
+    pairs = Pairs(*map(jnp.asarray, pairs))  # those of a finished fit are on the host
     away = js.sum_corners(vertices, pairs.corners, pairs.corner_weights) - pairs.points
     return dot(pairs.directions, away)[:, 0]
 
