@@ -137,10 +137,10 @@ def test_landmarks_pull_the_fit_to_them():
 
     free, near, firm = (
         off(None),
-        off(Landmarks(there, on_mesh)),
+        off(Landmarks(there, on_mesh), landmark_deviation=0.3),
         off(Landmarks(there, on_mesh), landmark_deviation=0.05),
     )
-    assert firm < 0.5 * near < near < free
+    assert firm < 0.3 * near and near < 0.8 * free
     heavy = off(Landmarks(there, on_mesh, np.full(4, 400.0)))
     np.testing.assert_allclose(heavy, firm, rtol=1e-6)
 
