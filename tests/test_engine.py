@@ -117,6 +117,21 @@ def test_conjugate_gradients_come_to_the_surface_of_the_sparse_equations(search_
     np.testing.assert_allclose(found.uncertainty().control, expected.uncertainty().control, rtol=1e-4)
 
 
+@pytest.mark.parametrize("change", ["shuffled", "moved by rounding"])
+def test_surface_does_not_depend_on_order_or_rounding(change):
+    """On a scan that has points at the control vertices where the fit starts: no direction leads to these."""
+    rng, start = np.random.default_rng(2), np.asarray(problem().start.vertices)
+    points = np.asarray(problem().points + noise())
+    points[: len(start)] = start
+    order = rng.permutation(N_POINTS)
+    others = points[order] if change == "shuffled" else points * (1 + 1e-13 * rng.normal(size=points.shape))
+    first, other = problem().fit(points), problem().fit(others)
+    across = np.sum((np.asarray(other.surface.vertices) - first.surface.vertices) * first.surface.normals, axis=1)
+    assert np.percentile(np.abs(across), 95) < 0.1 * np.median(first.uncertainty().surface)
+    off = np.linalg.norm(np.asarray(other.control.vertices) - first.control.vertices, axis=1)
+    assert np.percentile(off, 95) < 0.02 * float(first.fit.model.edge)
+
+
 # Other solvers
 
 
