@@ -132,6 +132,17 @@ def test_surface_does_not_depend_on_order_or_rounding(change):
     assert np.percentile(off, 95) < 0.02 * float(first.fit.model.edge)
 
 
+def test_directions_to_points_much_nearer_than_the_noise_are_normals():
+    rng, start = np.random.default_rng(2), problem().start
+    points = np.asarray(problem().points + noise())
+    n = len(start.vertices)
+    points[:n] = np.asarray(start.vertices) + 1e-3 * rng.normal(size=(n, 3))
+    found = problem().fit(points, max_sweeps=0)
+    directions = np.asarray(found.fit.look.pairs.directions)[:n]
+    normals = np.asarray(js.evaluate(found.surface, found.at).normals)[:n]
+    assert np.abs(np.sum(directions * normals, axis=1)).min() > 0.99
+
+
 # Other solvers
 
 
