@@ -332,7 +332,7 @@ def _keep_what_serves_again() -> None:
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxsubdiv"
         jax.config.update("jax_compilation_cache_dir", str(cache))
-    # A fit compiles a hundred small programs besides few large ones: reading them all is a quarter of a warm start.
+    # A fit compiles many small programs besides few large ones: they are kept too.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 import jaxsubdiv as js
 
 from ..model.residual import Model, Pairs
+from .elements import face_corners
 
 _LEVELS = 2
 
@@ -49,7 +50,7 @@ def coarsen(model: Model) -> Coarse | None:
         return None
     bare = js.ControlMesh(model.template, topology.control_faces, check=False)
     coarser = js.build_topology(bare, scheme, _LEVELS)
-    fine, coarse = _corners(topology), _corners(coarser)
+    fine, coarse = (face_corners(one.faces).astype(np.int64) for one in (topology, coarser))
     ancestor = np.arange(len(fine)) // 4 ** (n_levels - _LEVELS)
     n = int(coarse.max()) + 1
     midpoints = _midpoint_weights(topology, n)
@@ -60,11 +61,6 @@ def coarsen(model: Model) -> Coarse | None:
     is_triangle = coarse[ancestor, 3] == coarse[ancestor, 2]
     weights[is_triangle, :, 3] = 0
     return Coarse(eqx.tree_at(lambda one: one.topology, model, coarser), weights, coarse[ancestor])
-
-
-def _corners(topology: js.Topology) -> Int[np.ndarray, "g 4"]:
-    triangles, quads = (np.asarray(topology.faces[size]) for size in (3, 4))
-    return np.concatenate([triangles[:, [0, 1, 2, 2]], quads]).astype(np.int64)
 
 
 def _midpoint_weights(topology: js.Topology, n: int) -> sp.csr_array:

@@ -79,10 +79,15 @@ class Derivatives(NamedTuple):
     """Of all vertices, and of the rows, along the last seed."""
 
 
+def face_corners(faces: dict[int, Any]) -> Int[np.ndarray, "g 4"]:
+    """Vertices of every face, the triangles first; the last of a triangle twice."""
+    triangles, quads = (np.asarray(faces[size]) for size in (3, 4))
+    return np.concatenate([triangles[:, [0, 1, 2, 2]], quads])
+
+
 def find_patches(surface: js.RefinedSurface, owner: Int[np.ndarray, "g"], n_control_faces: int) -> Patches:
     """The patches of a surface, from the control face of each of its faces."""
-    triangles, quads = (np.asarray(surface.faces[size]) for size in (3, 4))
-    corners = np.concatenate([np.concatenate([triangles, triangles[:, 2:]], axis=1), quads])
+    corners = face_corners(surface.faces)
     n = surface.vertices.shape[0]
     keys, place = np.unique(owner[:, None].astype(np.int64) * n + corners, return_inverse=True)
     of_key = keys // n
