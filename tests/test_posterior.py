@@ -76,7 +76,7 @@ def dense(equations: SparseEquations, matrix) -> np.ndarray:
 @pytest.mark.parametrize(("kind", "levels"), [("default", 2), ("h a level", 2), ("circle", 1)])
 def test_derivatives_by_elements_are_those_in_full(kind, levels):
     model, y, held, in_full = mixed_rows(kind, levels)
-    structure = find_structure(model, y, held.priors, coarse=False)
+    structure = find_structure(model, y, held.priors)
     equations = SparseEquations(structure, model, y, held)
     np.testing.assert_allclose(equations.values["distance"], -0.1, atol=1e-12)
     for name in in_full.keys() - {"distance"}:
@@ -94,9 +94,9 @@ def test_derivatives_by_elements_are_those_in_full(kind, levels):
 def test_sums_over_parts_of_the_faces_are_those_over_all(monkeypatch):
     """A few faces at a time, as it is done where there are many."""
     model, y, held, in_full = mixed_rows("default", 2)
-    elements = find_structure(model, y, held.priors, coarse=False).elements
+    elements = find_structure(model, y, held.priors).elements
     monkeypatch.setattr(_elements, "_ENTRIES_AT_ONCE", 5 * elements.columns.shape[1] ** 2)
-    structure = find_structure(model, y, held.priors, coarse=False)
+    structure = find_structure(model, y, held.priors)
     assert len(elements.runs) == 1 and len(structure.elements.runs) == -(-len(elements.columns) // 5)
     equations = SparseEquations(structure, model, y, held)
     by, weights = in_full["distance"], held.distance_precisions
@@ -108,7 +108,7 @@ def test_sums_over_parts_of_the_faces_are_those_over_all(monkeypatch):
 def test_rows_of_a_face_make_matrices_and_gradients():
     """More rows a face than are multiplied at once."""
     model, y, held, _ = mixed_rows("default", 2)
-    elements = find_structure(model, y, held.priors, coarse=False).elements
+    elements = find_structure(model, y, held.priors).elements
     rng, m = np.random.default_rng(3), 40 * len(elements.columns)
     face, weights = rng.integers(len(elements.columns), size=m), rng.uniform(0.5, 2, m)
     by = np.where(elements.columns[face] < elements.n, rng.normal(size=(m, elements.columns.shape[1])), 0.0)

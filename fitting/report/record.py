@@ -107,7 +107,7 @@ class Fit:
     def equations(self) -> SparseEquations:
         """The normal equations about the surface found."""
         held = self.held()
-        structure = find_structure(self.model, self.y, held.priors, coarse=False)
+        structure = find_structure(self.model, self.y, held.priors)
         return SparseEquations(structure, self.model, self.y, held)
 
 

@@ -21,11 +21,10 @@ import jaxsubdiv as js
 
 from ..model.priors import AbstractVertexPrior
 from ..model.priors.shifts import ShiftPrior
-from ..model.residual import Held, Model, Residual, signed_distances
+from ..model.residual import Held, Model, signed_distances
 from ..model.unknowns import Layout, Unknowns, Variables
 from .cholesky import Factor, Symbolic
 from .cholesky import analyse as analyse_pattern
-from .coarse import Coarse, coarsen
 from .elements import (
     Elements,
     Patches,
@@ -105,10 +104,6 @@ class Structure:
     """What the analysis of a model finds: the same for all sweeps."""
 
     layout: Layout
-    coarse: Coarse | None
-    """The coarser level whose derivatives make the matrices; None where those of the full surface do."""
-    descendants: int
-    """How many faces of the surface descend from each of the level's."""
     elements: Elements
     patches: Patches
     tied: list[_Tied]
@@ -157,19 +152,16 @@ class Structure:
         return Arrowhead(inner, matrix[:n, n:].toarray(), matrix[n:, n:].toarray())
 
 
-def find_structure(model: Model, y: Variables, held: dict[str, Any], *, coarse: bool = True) -> Structure:
+def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> Structure:
     """Find which unknowns belong to which rows: so few rings of faces that explain all derivatives.
 
     Args:
         held: what each prior holds where a fit starts.
-        coarse: whether matrices may come from a coarser level.
 
     Raises:
         ValueError: a face of the scheme depends on too many control vertices.
     """
-    full = model.bare()
-    coarser = coarsen(full) if coarse else None
-    model = full if coarser is None else coarser.model
+    model = model.bare()
     surface = model.refine(y)
     owner = js.control_faces_of(model.scheme, model.topology, surface, y.control)
     patches = find_patches(surface, owner, model.topology.n_control_faces)
@@ -200,8 +192,6 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any], *, coarse: 
     fixed = np.asarray(model.is_free)[:n] == 0
     return Structure(
         layout,
-        coarser,
-        4 ** (len(full.topology.levels) - len(model.topology.levels)),
         elements,
         patches,
         tied,
@@ -260,35 +250,18 @@ def _differentiate_tied(
 _measure_distances = jax.jit(signed_distances)
 
 
-@eqx.filter_jit
-def _pull_distances(model: Model, y: Variables, held: Held) -> tuple[Float[Array, "p"], Float[Array, "n"]]:
-    """The distances at a place, and the exact gradient of half their weighed squared sum: one reverse pass."""
-
-    def measure(vector: Float[Array, "n"]) -> Float[Array, "p"]:
-        moved = model.retract(y, model.layout.split(vector))
-        return Residual(model).distances(model.place(moved, model.refine(moved)), held)
-
-    distances, pull = jax.vjp(measure, jnp.zeros(model.layout.n, y.control.vertices.dtype))
-    return distances, pull(held.distance_precisions.astype(distances.dtype) * distances)[0]
-
-
 class SparseEquations:
-    """Linearised rows about one place on the host: what scan and priors say of the unknowns.
-
-    The gradient is exact, that of the full surface; the matrices may be of a coarser level, see `coarsen`, on which the
-    rows of priors are the same.
-    """
+    """Linearised rows about one place on the host: what scan and priors say of the unknowns."""
 
     def __init__(self, structure: Structure, model: Model, y: Variables, held: Held):
         self.structure, self.model, self.y, self.held = structure, model, y, held
         self._bare = bare = model.bare()
-        self._matrix_model = bare if structure.coarse is None else structure.coarse.model
         self.gradient = np.zeros(model.layout.n)
         self.values: dict[str, Float[np.ndarray, "m"]] = {}
         """Rows of each prior, before they are weighed."""
         self._row_faces = row_faces(model, held.priors)
         tables = structure.elements.seeds, structure.elements.seeds_of, self._row_faces, structure.patches.vertices
-        self.found = differentiate(self._matrix_model, y, held.priors, *tables)
+        self.found = differentiate(bare, y, held.priors, *tables)
         self._by: dict[str, Float[np.ndarray, "m d"]] = {}
         self._tied_jacobians: dict[str, sp.csr_array] = {}
         self._known: dict[tuple[str, bytes], ArrowheadFactor] = {}
@@ -396,19 +369,14 @@ class SparseEquations:
         return self.model.layout.n - self.structure.n
 
     def _add_distances(self) -> Arrowhead:
-        """The scan's matrix."""
+        """The scan's matrix; its gradient is added to that of all."""
         structure, held, n = self.structure, self.held, self.structure.n
         elements, patches, by_surface = structure.elements, structure.patches, self.found.by_surface
         weights, pairs, at = np.asarray(held.distance_precisions, np.float64), held.pairs, np.asarray(held.faces)
-        if structure.coarse is None:  # these derivatives give the gradient too, and save a program
-            distances = np.asarray(_measure_distances(self.found.surface, pairs), np.float64)
-            pulls = sp.csr_array((weights * distances)[:, None])
-            self.gradient[: elements.n] += distances_transposed(elements, patches, by_surface, pairs, pulls, at)[:, 0]
-        else:
-            distances, gradient = (np.asarray(part, np.float64) for part in _pull_distances(self._bare, self.y, held))
-            self.gradient += gradient
-            pairs, at = structure.coarse.transfer(pairs, at), at // structure.descendants
+        distances = np.asarray(_measure_distances(self.found.surface, pairs), np.float64)
         self.values["distance"] = distances
+        pulls = sp.csr_array((weights * distances)[:, None])
+        self.gradient[: elements.n] += distances_transposed(elements, patches, by_surface, pairs, pulls, at)[:, 0]
         found = structure.arrange(distance_matrix(elements, patches, by_surface, pairs, weights, at), self._n_shared)
         if held.of_points is None:
             return found
@@ -422,8 +390,7 @@ class SparseEquations:
         found.corner[:n_h, shifts] += across[n:]
         found.corner[shifts, :n_h] += across[n:].T
         found.corner[shifts, shifts] += (by_shifts.T @ weighed).toarray()
-        if structure.coarse is None:
-            self.gradient[self.model.layout.columns("shifts")] += weighed.T @ self.values["distance"]
+        self.gradient[columns] += weighed.T @ distances
         return found
 
     def _shift_derivatives(self) -> sp.csr_array:
@@ -580,6 +547,6 @@ def _inverse(matrix: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
 
 def sparse_solver(model: Model, y: Variables, held: Held) -> SparseNormal:
     """The sparse normal equations of a residual's rows as a linear solver for `optx.GaussNewton`."""
-    structure = find_structure(model, y, held.priors, coarse=False)
+    structure = find_structure(model, y, held.priors)
     faces = np.concatenate([structure.patches.owner[np.asarray(held.faces)], row_faces(model, held.priors)])
     return SparseNormal(structure, faces, ("distance", *(prior.name for prior in model.face_priors)))

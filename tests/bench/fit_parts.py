@@ -28,7 +28,6 @@ PARTS = {
     "derivatives": [
         "fitting.solve.sparse_normal.differentiate",
         "fitting.solve.sparse_normal._differentiate_tied",
-        "fitting.solve.sparse_normal._pull_distances",
     ],
     "normal equations": ["fitting.solve.sweeps.SparseNormal.linearise"],
     "factorisation": ["fitting.solve.sparse_normal.SparseEquations.factorise"],

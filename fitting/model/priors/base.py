@@ -125,9 +125,6 @@ class AbstractPrior(eqx.Module):
 class AbstractFacePrior(AbstractPrior):
     """A prior each of whose rows depends on the unknowns of one control face's neighbourhood, and on h."""
 
-    needs_full_surface: ClassVar[bool] = False
-    """Whether its rows look at vertices of the surface beyond those of the first level."""
-
     def faces(self, held: Any) -> Int[AnyArray, "m"]:
         """The control face of every row."""
         raise NotImplementedError

@@ -98,7 +98,6 @@ class BoundaryPrior(AbstractFacePrior):
     """
 
     name: ClassVar[str] = "rim"
-    needs_full_surface: ClassVar[bool] = True
     points: Float[Array, "b 3"]
     counts: Float[Array, "b"]
     deviation: Float[Array, ""]

@@ -26,7 +26,6 @@ class LandmarkPrior(AbstractFacePrior):
     """
 
     name: ClassVar[str] = "landmark"
-    needs_full_surface: ClassVar[bool] = True
     points: Float[Array, "l 3"]
     face: Int[Array | np.ndarray, "l"]
     corners: Int[Array, "l 4"]
