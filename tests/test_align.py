@@ -174,7 +174,7 @@ def test_a_mirrored_scan_is_told_and_not_followed():
     with pytest.warns(UserWarning, match="fits better as a mirror image .* two axes were exchanged"):
         found = fitting.align(mesh, Scan(scan_of(mesh) @ swap.T))
     assert np.linalg.det(found.transform[:3, :3]) > 0
-    assert "mirror" in found.doubts[0]
+    assert "mirror" in found.doubts[0].text
 
 
 @pytest.mark.parametrize(
@@ -201,14 +201,14 @@ def test_two_answers_are_told():
     mesh, quarter = ellipsoid(), Rotation.from_rotvec([0, 0, np.pi / 2])
     with pytest.warns(UserWarning, match="alignment: two poses fit alike"):
         found = fitting.align(mesh, Scan(quarter.apply(scan_of(mesh, sigma=0.2))))
-    assert "two poses fit alike" in found.doubts[0]
+    assert "two poses fit alike" in found.doubts[0].text
     assert fitting.align(mesh, Scan(scan_of(mesh, sigma=0.2))).doubts == ()  # the pose as given says which
 
 
 def test_nothing_in_common():
     rng = np.random.default_rng(0)
     found = quietly(bean(), Scan(rng.uniform(-100, 100, (3000, 3))))
-    assert any("mm off where it fits best" in doubt for doubt in found.doubts)
+    assert any("mm off where it fits best" in doubt.text for doubt in found.doubts)
 
 
 # ---------------------------------------------------------------------------------------------------------- landmarks
@@ -252,7 +252,7 @@ def test_landmarks_never_mirror():
     flipped = mesh.vertices * (-1, 1, 1)
     found = quietly(mesh, Scan(flipped), landmarks=(flipped[rows], rows), refine=False)
     assert np.linalg.det(found.transform[:3, :3]) > 0
-    assert any("landmarks far from their place: rows" in doubt for doubt in found.doubts)
+    assert any("landmarks far from their place: rows" in doubt.text for doubt in found.doubts)
 
 
 def test_one_landmark_does_not_fix_a_pose():

@@ -12,6 +12,7 @@ import jaxsubdiv as js
 
 from ..start.align import Kind
 from ..start.control_mesh import FaceKind
+from ..start.parts import PartKind
 from .priors import Priors
 from .priors.shape_modes import ShapeModes
 from .robust import AbstractLoss, Barron, Huber, LeastSquares, Tukey, geman_mcclure
@@ -36,7 +37,8 @@ class Settings:
         priors: what is known of the surface beforehand.
         loss: how a point loses weight with its distance.
         max_sweeps, tolerance, landmark_deviation: see `fit`.
-        faces, kind, closed, pose, tolerance_mm, most_faces, most_points: see `fit_scan`; `fit` has no use for them.
+        faces, kind, closed, part, pose, mirror, tolerance_mm, most_faces, most_points: see `fit_scan`; `fit` has no use
+            for them.
         mesh_normals, limit: see `js.build_topology`.
     """
 
@@ -51,7 +53,9 @@ class Settings:
     faces: int = 500
     kind: FaceKind = "triangle"
     closed: bool | None = None
+    part: PartKind | None = None
     pose: Kind | None = "similarity"
+    mirror: bool = False
     tolerance_mm: float | None = None
     most_faces: int = 10_000
     most_points: int | None = None
@@ -117,6 +121,8 @@ class Settings:
             "faces": lambda value: _checked("faces", value, int),
             "kind": lambda value: _one_of("kind", value, get_args(FaceKind)),
             "closed": lambda value: None if value is None else _checked("closed", value, bool),
+            "part": lambda value: _one_of("part", value, (*get_args(PartKind), None)),
+            "mirror": lambda value: _checked("mirror", value, bool),
             "pose": lambda value: _one_of("pose", value, (*get_args(Kind), None)),
             "tolerance_mm": lambda value: None if value is None else _number("tolerance_mm", value),
             "most_faces": lambda value: _checked("most_faces", value, int),

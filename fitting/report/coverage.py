@@ -48,8 +48,8 @@ def distances_to_scan(surface: js.RefinedSurface, seen: Look, inliers: Bool[np.n
     scan is between them. NaN where the scan does not cover the surface: where no such place is nearer than five times
     the usual distance from one to the next.
     """
-    vertices, normals = np.asarray(surface.vertices, np.float64), _unit(np.asarray(surface.normals, np.float64))
-    feet, sides = _at_pairs(vertices, seen)[inliers], _unit(_at_pairs(normals, seen))[inliers]
+    vertices, normals = np.asarray(surface.vertices, np.float64), unit(np.asarray(surface.normals, np.float64))
+    feet, sides = at_pairs(vertices, seen)[inliers], unit(at_pairs(normals, seen))[inliers]
     if not len(feet):
         return np.full(len(vertices), np.nan)
     tree = KDTree(feet)
@@ -73,7 +73,7 @@ def worst_places(
         edge: length of a control edge in mm; places are at least so far apart.
         n: how many at most.
     """
-    on = _at_pairs(np.asarray(surface.vertices, np.float64), seen)
+    on = at_pairs(np.asarray(surface.vertices, np.float64), seen)
     many, centres = (slice(None, None, -(-len(on) // most)) for most in (_MANY, _CENTRES))
     a_disc = np.pi * (edge / 4) ** 2 / float(surface.areas().sum())
     k = min(int(np.clip(len(on[many]) * a_disc, *_NEAR_PLACE)), len(on[many]))
@@ -103,11 +103,12 @@ def _spacing(tree: KDTree, points: Float[np.ndarray, "p 3"]) -> float:
     return float(np.median(away[away > 0])) if np.any(away > 0) else 0.0
 
 
-def _at_pairs(values: Float[np.ndarray, "v 3"], seen: Look) -> Float[np.ndarray, "p 3"]:
+def at_pairs(values: Float[np.ndarray, "v 3"], seen: Look) -> Float[np.ndarray, "p 3"]:
     """Values at the surface points that are paired with the scan."""
     weights = np.asarray(seen.pairs.corner_weights, np.float64)
     return np.einsum("pk,pkx->px", weights, values[np.asarray(seen.pairs.corners)])
 
 
-def _unit(rows: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def unit(rows: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Rows of length 1; zero stays zero."""
     return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), np.finfo(float).tiny)

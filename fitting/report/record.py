@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 import jaxsubdiv as js
 
+from ..finding import Origin
 from ..model.pairing import Look, Scene
 from ..model.recipe import Settings
 from ..model.residual import Held, Model
@@ -38,6 +39,7 @@ class Fit:
         settings: what the fit was told.
         rms, robust_rms: of the distances in mm, at the start and after every sweep.
         result: why it ended.
+        origin: how it came to its start.
     """
 
     model: Model
@@ -54,6 +56,7 @@ class Fit:
     rms: Float[np.ndarray, "sweeps"]
     robust_rms: Float[np.ndarray, "sweeps"]
     result: optx.RESULTS
+    origin: Origin = dataclasses.field(default_factory=Origin)
 
     @property
     def topology(self) -> js.Topology:

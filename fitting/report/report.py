@@ -4,6 +4,8 @@ import dataclasses
 import json
 import math
 
+from ..finding import Finding, Pose
+
 
 @dataclasses.dataclass(frozen=True)
 class WorstPlace:
@@ -39,6 +41,9 @@ class Report:
     """The numbers of a fit; distances in mm. They are from the scan's points to the surface where nothing else is said.
 
     Attributes:
+        trusted: whether nothing speaks against the fit.
+        warnings: what does.
+        pose: how the template was moved to the scan; None where there was none, or where it stayed.
         converged: whether the last sweeps left the fit where it was.
         reason: why not, in words; empty where it did.
         rms_start, rms: root mean square distance before and after.
@@ -66,6 +71,9 @@ class Report:
         worst: up to five places where the scan lies farthest from the surface, one control edge apart.
     """
 
+    trusted: bool
+    warnings: list[Finding]
+    pose: Pose | None
     converged: bool
     reason: str
     sweeps: int
@@ -107,8 +115,10 @@ class Report:
         """The same as names and values in words: a table of two columns."""
         state = f"converged after {self.sweeps} sweeps" if self.converged else f"NOT CONVERGED: {self.reason}"
         h = [] if self.h is None else self.h if isinstance(self.h, list) else [self.h]
-        rows = [
-            ("fit", state),
+        rows = [("fit", state)]
+        if self.pose is not None:
+            rows.append(("template", str(self.pose)))
+        rows += [
             ("RMS distance", f"{self.rms:.3f} mm (from {self.rms_start:.3f} mm)"),
             ("mean / median", f"{self.mean:.3f} / {self.median:.3f} mm"),
             ("95th percentile / maximum", f"{self.percentile_95:.3f} / {self.maximum:.3f} mm"),
@@ -149,11 +159,13 @@ class Report:
             rows.append((f"worst place {i + 1}", f"{place.distance:+.3f} mm at ({at}), {place.n_points:,} points"))
         if self.rms_inliers > self.rms_start:
             rows.append(("note", "worse than the start: is the control mesh too coarse for the scan?"))
+        rows += [(f"WARNING {i + 1}", finding.text) for i, finding in enumerate(self.warnings)]
         return rows
 
     def as_dict(self) -> dict[str, object]:
         """The same as plain values."""
-        return dataclasses.asdict(self)
+        pose = None if self.pose is None else self.pose._asdict()
+        return dataclasses.asdict(self) | {"pose": pose, "warnings": [one._asdict() for one in self.warnings]}
 
     def as_json(self) -> str:
         """The same as JSON text; refuses values that JSON does not have."""

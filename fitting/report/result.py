@@ -13,10 +13,12 @@ from jaxtyping import Bool, Float
 
 import jaxsubdiv as js
 
+from ..finding import Finding
 from ..model.pairing import make_scene
 from ..model.recipe import Settings
 from ..scan.scan import Scan
 from .coverage import distances_to_scan, vertex_areas, weighted_quantile, worst_places
+from .findings import find_what_speaks_against, gather_evidence
 from .posterior import Posterior, Uncertainty
 from .record import Fit, look_at
 from .refit import Refit, make_refit
@@ -89,6 +91,22 @@ class FitResult:
         return self.posterior.uncertainty()
 
     @functools.cached_property
+    def warnings(self) -> list[Finding]:
+        """What speaks against the fit, and against where it started; empty where nothing does."""
+        areas, to_scan = self._seen_from_the_scan
+        return find_what_speaks_against(gather_evidence(self.fit, self.surface, areas, ~np.isnan(to_scan)))
+
+    @property
+    def trusted(self) -> bool:
+        """Whether nothing speaks against the fit: it converged, and there are no `warnings`."""
+        return not self.warnings
+
+    @functools.cached_property
+    def _seen_from_the_scan(self) -> tuple[Float[np.ndarray, "v"], Float[np.ndarray, "v"]]:
+        """Of every vertex of the surface its area, and its distance to the scan; see `distances_to_scan`."""
+        return vertex_areas(self.surface), distances_to_scan(self.surface, self.fit.look, self.inliers)
+
+    @functools.cached_property
     def control_mesh(self) -> js.ControlMesh:
         """The fitted control mesh with its normals, for `js.write_mesh`."""
         return js.ControlMesh(self.control.vertices, self.fit.topology.control_faces, self.control.normals, check=False)
@@ -154,13 +172,16 @@ class FitResult:
         Args:
             uncertainty: with that of the surface, which takes a second or more.
         """
-        areas, to_scan = vertex_areas(self.surface), distances_to_scan(self.surface, self.fit.look, self.inliers)
+        areas, to_scan = self._seen_from_the_scan
         covered = ~np.isnan(to_scan)
         areas_there, away = areas[covered], np.abs(to_scan[covered])
         known, share = bool(areas_there.sum() > 0), areas_there / max(areas_there.sum(), np.finfo(float).tiny)
         spread = self.uncertainty().surface[covered] if uncertainty and known else None
         edge = float(js.edge_length(self.fit.topology, self.control.vertices))
         return Report(
+            trusted=self.trusted,
+            warnings=self.warnings,
+            pose=self.fit.origin.pose,
             converged=bool(self.result == optx.RESULTS.successful),
             reason=_words(self.result),
             sweeps=len(self.rms) - 1,

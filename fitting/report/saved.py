@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 import jaxsubdiv as js
 from jaxsubdiv.files import replacing
 
+from ..finding import Origin
 from ..model.pairing import Look, make_scene
 from ..model.priors.boundary import BoundaryCurve
 from ..model.priors.landmarks import Anchors
@@ -49,6 +50,7 @@ def save_fit(folder: str | os.PathLike[str], fit: Fit, recipe: Settings) -> None
         "version": _VERSIONS[-1],
         "recipe": text,
         "settings": own,
+        "origin": fit.origin.to_json(),
         "result": next(name for name in _ENDS if bool(fit.result == getattr(optx.RESULTS, name))),
         "control_vertices": fit.y.control.vertices,
         "control_normals": fit.y.control.normals,
@@ -242,4 +244,5 @@ def _restore(arrays: dict[str, np.ndarray]) -> Fit:
         rms=rms,
         robust_rms=robust_rms,
         result=getattr(optx.RESULTS, str(arrays["result"])),
+        origin=Origin.from_json(str(arrays["origin"])) if "origin" in arrays else Origin(),
     )

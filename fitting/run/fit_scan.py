@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 
 import jaxsubdiv as js
 
+from ..finding import Origin
 from ..model.priors import Priors
 from ..model.priors.symmetry import Symmetry, find_symmetry
 from ..model.recipe import Settings
@@ -21,8 +22,9 @@ from ..report.result import FitResult
 from ..scan.closest_points import nearest_rows
 from ..scan.landmarks import Landmarks
 from ..scan.scan import Scan
-from ..start.align import Alignment, Kind, align, put
-from ..start.control_mesh import FaceKind, control_mesh
+from ..start.align import Alignment, Kind, align, mirror_image, put
+from ..start.control_mesh import FaceKind, make_control_mesh
+from ..start.parts import PartKind
 from .checkpoint import Checkpoint
 from .fit import check, fit
 from .memory import memory_of_fit
@@ -56,8 +58,11 @@ class _Start(NamedTuple):
     scheme: js.AbstractScheme
     alignment: Alignment | None
     splits: int
+    origin: Origin
     unseen: Bool[np.ndarray, "f"] | None = None
     """Control faces without scan points, of a mesh that was split; None before."""
+    shown: Bool[np.ndarray, "p"] | None = None
+    """Points that do not lie on parts of the scan that were left out; None is all."""
 
 
 def fit_scan(
@@ -69,7 +74,9 @@ def fit_scan(
     faces: int = Settings.faces,
     kind: FaceKind = Settings.kind,
     closed: bool | None = Settings.closed,
+    part: PartKind | None = Settings.part,
     pose: Kind | None = Settings.pose,
+    mirror: bool = Settings.mirror,
     landmarks: Landmarks | None = None,
     tolerance_mm: float | None = Settings.tolerance_mm,
     most_faces: int = Settings.most_faces,
@@ -85,8 +92,10 @@ def fit_scan(
         mesh: the template; default: a control mesh is made from the scan, see `control_mesh`.
         scheme: default: `js.Interpolating()`.
         levels: of refinement, see `Recipe`.
-        faces, kind, closed: of the control mesh, where it is made; see `control_mesh`.
+        faces, kind, closed, part: of the control mesh, where it is made; see `control_mesh`. Points of the scan on
+            parts that are left out are not fitted.
         pose: how the template may move to the scan before the fit, see `align`; None leaves it where it is.
+        mirror: take the template's mirror image, which serves the other side of the body.
         landmarks: places on scan and template, for the alignment and the fit; see `Landmarks`.
         tolerance_mm: split the control mesh by the scheme's own rule, and fit again, until the misfit (see `misfit`) is
             this small, or too small to be told from the noise, or the next split would make too many faces for
@@ -112,9 +121,14 @@ def fit_scan(
     say = on_stage or (lambda words: None)
     first = scheme or js.Interpolating()
     of_tables = {name: options.pop(name) for name in ("mesh_normals", "limit") if name in options}
-    settings = {"faces": faces, "kind": kind, "closed": closed, "pose": pose}
+    settings = {"faces": faces, "kind": kind, "closed": closed, "part": part, "pose": pose, "mirror": mirror}
     settings |= {"tolerance_mm": tolerance_mm, "most_faces": most_faces, "most_points": most_points}
-    whole, scan = scan, scan if most_points is None else scan.drawn(most_points)
+    if mirror:
+        if mesh is None:
+            raise ValueError("`mirror` is of a template, and there is none: give one, or leave `mirror` out.")
+        if pose is None:
+            raise ValueError("`mirror` takes the template out of its place: let it be aligned by a `pose`.")
+        mesh, landmarks = mirror_image(mesh, landmarks)
     kept = before = None
     if checkpoint is not None:
         template = None if mesh is None else (mesh.vertices, mesh.faces, mesh.normals)
@@ -127,15 +141,19 @@ def fit_scan(
         start = _recalled(before, first, mesh)
     elif mesh is None:
         say(f"makes a control mesh of about {faces} faces")
-        made = control_mesh(scan, faces=faces, kind=kind, closed=closed)
-        start = _Start(made.triangulated() if first.takes == (3,) else made, first, None, 0)
+        made = make_control_mesh(scan, faces=faces, kind=kind, closed=closed, part=part)
+        origin = Origin(None, made.findings)
+        mesh_made = made.mesh.triangulated() if first.takes == (3,) else made.mesh
+        start = _Start(mesh_made, first, None, 0, origin, shown=None if made.shown.all() else made.shown)
     elif pose is not None:
         say("aligns the control mesh with the scan")
         alignment = align(mesh, scan, kind=pose, landmarks=landmarks)
-        start = _Start(alignment.mesh, first, alignment, 0)
+        start = _Start(alignment.mesh, first, alignment, 0, Origin(alignment.pose, alignment.doubts))
     else:
-        start = _Start(mesh, first, None, 0)
+        start = _Start(mesh, first, None, 0, Origin())
     own_partners = options.pop("symmetry", None)
+    whole = scan if start.shown is None else scan.rows(start.shown)
+    scan = whole if most_points is None else whole.drawn(most_points)
     while True:
         # Tables come from the faces alone; normals that would fold the surface are replaced in the fit.
         bare = js.ControlMesh(start.mesh.vertices, start.mesh.faces)
@@ -165,14 +183,14 @@ def fit_scan(
         unseen = np.zeros(finer.n_faces, bool)
         if js.splits_in_four(result.scheme, topology):
             unseen = np.repeat(~_has_points(result), 4)
-        start = _Start(finer, result.scheme, start.alignment, start.splits + 1, unseen)
+        start = _Start(finer, result.scheme, start.alignment, start.splits + 1, start.origin, unseen, start.shown)
     if kept is not None:
         kept.remove()
     if scan is not whole:
         say(f"measures all {whole.n_points:,} points")
         result = result.on(whole)
-    assert result.recipe is not None
-    result.recipe = dataclasses.replace(result.recipe, scheme=first, priors=priors, **settings)
+    recipe = dataclasses.replace(result.recipe, scheme=first, priors=priors, **settings)
+    result = FitResult(dataclasses.replace(result.fit, origin=start.origin), recipe=recipe)
     return ScanFit(result, start.mesh, start.alignment, start.splits, outcome)
 
 
@@ -200,8 +218,11 @@ def _arrays(start: _Start) -> dict[str, Any]:
     """A start as a checkpoint keeps it; the mesh of the alignment follows from the rest."""
     mesh, alignment = start.mesh, start.alignment
     arrays = {"vertices": mesh.vertices, "triangles": mesh.faces[3], "quads": mesh.faces[4], "normals": mesh.normals}
-    arrays |= {"h": start.scheme.h, "splits": start.splits, "unseen": start.unseen}
-    return arrays if alignment is None else arrays | alignment._replace(mesh=None)._asdict()
+    arrays |= {"h": start.scheme.h, "splits": start.splits, "unseen": start.unseen, "origin": start.origin.to_json()}
+    arrays["shown"] = start.shown
+    if alignment is None:
+        return arrays
+    return arrays | {"transform": alignment.transform, "rms": alignment.rms, "share": alignment.share}
 
 
 def _recalled(arrays: dict[str, np.ndarray], scheme: js.AbstractScheme, template: js.ControlMesh | None) -> _Start:
@@ -210,11 +231,12 @@ def _recalled(arrays: dict[str, np.ndarray], scheme: js.AbstractScheme, template
     )
     if scheme.h is not None:
         scheme = eqx.tree_at(lambda s: s.h, scheme, jnp.asarray(arrays["h"]))
-    alignment = None
-    if template is not None and "transform" in arrays:
-        numbers = float(arrays["rms"]), float(arrays["share"]), tuple(map(str, arrays["doubts"]))
-        alignment = Alignment(arrays["transform"], put(template, arrays["transform"]), *numbers)
-    return _Start(mesh, scheme, alignment, int(arrays["splits"]), arrays.get("unseen"))
+    alignment, origin = None, Origin.from_json(str(arrays["origin"]))
+    if template is not None and "transform" in arrays and origin.pose is not None:
+        numbers = float(arrays["rms"]), float(arrays["share"])
+        there = put(template, arrays["transform"])
+        alignment = Alignment(arrays["transform"], there, *numbers, origin.findings, origin.pose)
+    return _Start(mesh, scheme, alignment, int(arrays["splits"]), origin, arrays.get("unseen"), arrays.get("shown"))
 
 
 def misfit(result: FitResult) -> float:

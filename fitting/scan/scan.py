@@ -6,7 +6,7 @@ from pathlib import Path
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 import jaxsubdiv as js
 from jaxsubdiv import read_texts, strong_float
@@ -99,8 +99,11 @@ class Scan(eqx.Module):
         """At most `n` of the points, drawn at random, always the same."""
         if n >= self.n_points:
             return self
-        rows = np.sort(np.random.default_rng(0).choice(self.n_points, n, replace=False))
-        return Scan(**{name: None if value is None else value[rows] for name, value in vars(self).items()})
+        return self.rows(np.sort(np.random.default_rng(0).choice(self.n_points, n, replace=False)))
+
+    def rows(self, chosen: Bool[np.ndarray, "p"] | Int[np.ndarray, "q"]) -> "Scan":
+        """Some of the points, with all that is known of each."""
+        return Scan(**{name: None if value is None else value[chosen] for name, value in vars(self).items()})
 
     def without_slices(self) -> "Scan":
         """The same points, each for itself."""

@@ -6,11 +6,14 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.linalg import polar
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 import jaxsubdiv as js
 
+from ..finding import Finding, Pose
+from ..scan.closest_points import nearest_rows
 from ..scan.landmarks import Landmarks, Placed, place_landmarks
 from ..scan.outliers import dense_points, one_a_cell
 from ..scan.scan import Scan, ScanError
@@ -21,8 +24,9 @@ _AT_MOST = 20_000  # points of the scan that are looked at
 _COARSE = (250, 1500)  # points of the scan and samples of the template, for every start
 _FINE = (1500, 8000)  # for the best starts
 _FIRST_STEPS, _COARSE_STEPS, _FINE_STEPS = 5, 12, 40
-_COARSE_BEST = 8
-_REFINED = 3
+_COARSE_BEST = 12
+_REFINED = 4
+_SAME_TURN = 10.0  # degrees: two starts that came so near each other come to one pose
 _MOVED = 1e-4  # of the size: a smaller step ends the search
 # Along the surface a pair pulls this much of what it pulls across: enough to hold what no point-to-plane row holds
 # (a sphere's rotation), too little to stop the slip that makes point-to-plane fast.
@@ -35,8 +39,14 @@ _CLEARLY = 0.75
 _NEARBY = 30.0  # degrees
 _MIRRORED = 0.6
 _FITS = 0.004  # of the size: with so little left, no mirror is looked into
-_ALIKE = 1.1
+_ALIKE, _ALIKE_IN_PART = 1.1, 1.5
 _FAR_ROTATION = 45.0  # degrees: two poses farther apart are two answers
+# Of two poses the better one has more points near. Near is this many times the distance that the nearest 30 % of the
+# points of the best pose keep: a template in its place explains its own bone of two, one blown up neither.
+_NEAR, _SURE = 8.0, 0.3
+_APART = 5  # neighbours that tell how far apart the points lie
+_FAR_SCALE = 1.5  # people of one kind hardly differ by more
+_WHOLE = 0.7  # share of the template with points near, below which a scan shows a part of it
 # Sizes that differ by more than this are no two people, but two units.
 _SAME_UNIT = 6.0
 _UNITS = {10.0: "cm and mm, or dm and cm", 25.4: "inches and mm", 100.0: "m and cm", 1000.0: "m and mm"}
@@ -54,8 +64,10 @@ class Alignment(NamedTuple):
     """Root mean square distance, in mm, of the scan points that count from the control mesh's flat faces."""
     share: float
     """Part of the scan's points that count, 0 to 1: the rest are outliers, or places that the template lacks."""
-    doubts: tuple[str, ...]
-    """Why it may be wrong, a sentence each; empty where nothing speaks against it."""
+    doubts: tuple[Finding, ...]
+    """Why it may be wrong; empty where nothing speaks against it."""
+    pose: Pose
+    """The same by its turn, scale and shift, with the shares of scan and template that lie near each other."""
 
 
 class _Surface(NamedTuple):
@@ -75,7 +87,7 @@ class _Moments(NamedTuple):
     """Root mean square distance from the centre."""
 
 
-class _Pose(NamedTuple):
+class _Map(NamedTuple):
     """x -> linear @ x + shift, template to scan."""
 
     linear: Float[np.ndarray, "3 3"]
@@ -109,9 +121,18 @@ class _Pairs(NamedTuple):
 
 
 class _Found(NamedTuple):
-    pose: _Pose
+    pose: _Map
     score: float
     """Root mean square distance of the part `keep` of the points that lies nearest."""
+    distances: Float[np.ndarray, "p"]
+    """Of all of them, sorted."""
+
+    def near_score(self, near: float) -> float:
+        """The same of all points, none of them farther than `near`, so that the rest of a scan has no say.
+
+        Source: Torr and Zisserman 2000 (MSAC).
+        """
+        return float(np.sqrt(np.mean(np.minimum(self.distances, near) ** 2)))
 
 
 def align(
@@ -125,8 +146,8 @@ def align(
 ) -> Alignment:
     """The control mesh moved to the scan, never mirrored.
 
-    Starts are the pose as given, the same moved onto the scan's middle, turned there by 30 degrees and with its axes in
-    every other order, and the 24 proper ways to lay the principal axes of the template on the scan's; or the landmarks
+    Starts are the pose as given, the same moved onto the scan's middle, turned there by 30 and 60 degrees and with its
+    axes in every other order, and the 24 proper ways to lay the principal axes of the template on the scan's; or the landmarks
     alone, where they fix a pose. From each a short trimmed ICP runs on few points; the best ones are refined, point to
     plane with Tukey's weights. A pose near the given one is taken unless another is clearly better. Scattered outliers
     are dropped first. The same input gives the same answer.
@@ -156,19 +177,20 @@ def align(
         raise ValueError(f"`keep` is a part of the scan, over 0 and up to 1; got {keep}.")
     mesh.check()
     placed = None if landmarks is None else place_landmarks(landmarks, mesh)
-    doubts: list[str] = []
+    doubts: list[Finding] = []
     start = None if placed is None else _landmark_pose(placed, kind)
     points = _thinned(np.asarray(scan.points, np.float64))
     if not refine:
         if start is None:
             raise ScanError("without `refine` the landmarks must fix the pose: give three or more, not on a line.")
-        return _finish(mesh, scan, points, start, _surface(mesh, _FINE[1]), placed, keep, doubts)
+        found = _Found(start, 0.0, np.zeros(0))
+        return _finish(mesh, scan, points, found, [], _surface(mesh, _FINE[1]), placed, keep, doubts)
 
     moments, of_mesh = _moments(points, "scan"), _moments(_surface(mesh, _FINE[1]).points, "template")
     unit = _unit_doubt(moments.size, of_mesh.size)
     if unit and start is None:
         raise ScanError(unit)
-    doubts += [unit] if unit else []
+    doubts += [Finding("unit", unit, {"scan": moments.size, "template": of_mesh.size})] if unit else []
 
     poses = _starts(of_mesh, moments, kind) if start is None else [start]
     surface, few = _surface(mesh, _COARSE[1]), _rows(points, _COARSE[0])
@@ -176,22 +198,32 @@ def align(
     best = _best_starts(poses, few, surface, free, keep, placed)
     surface, many = _surface(mesh, _FINE[1]), _rows(points, _FINE[0])
     fine = [_search(found.pose, many, surface, free, keep, placed, _FINE_STEPS) for found in best]
-    chosen = min(fine, key=lambda one: one.score * (_CLEARLY if _angle(one.pose.linear) < 2 * _NEARBY else 1))
+    near = _near(fine)
+    chosen = min(
+        fine, key=lambda one: one.near_score(near) * (_CLEARLY if _angle(one.pose.linear) < 2 * _NEARBY else 1)
+    )
+    others: list[_Found] = []
     if start is None:
         own = _search(chosen.pose, few, _surface(mesh, _COARSE[1]), free, keep, None, _COARSE_STEPS)
-        fits = own.score < _FITS * moments.size
-        mirrored = np.inf if fits else _mirrored(mesh, few, of_mesh, moments, free, keep)
-        if mirrored < _MIRRORED * own.score:
+        fits = np.quantile(own.distances, _SURE) < _FITS * moments.size
+        other = own if fits else _mirrored(mesh, few, of_mesh, moments, free, keep)
+        as_it_is, mirrored = (one.near_score(_near([own, other])) for one in (own, other))
+        if mirrored < _MIRRORED * as_it_is:
             doubts.append(
-                f"the scan fits better as a mirror image ({mirrored:.2g} against {own.score:.2g} mm): perhaps an axis "
-                "was flipped or two axes were exchanged when it was written. Undo that; a fit never mirrors."
+                Finding(
+                    "mirrored",
+                    f"the scan fits better as a mirror image ({mirrored:.2g} against {as_it_is:.2g} mm): it shows the "
+                    "other side of the body, or an axis was flipped or two axes were exchanged when it was written. "
+                    "Undo that, or give --mirror (`mirror=True`), which takes the template's mirror image.",
+                    {"mirrored": mirrored, "as_it_is": as_it_is},
+                )
             )
         else:
-            doubts += _other_answers(chosen, fine)
+            others = [one for one in fine if one is not chosen]
     pose = chosen.pose
     if kind == "affine":
         pose = _search(pose, many, surface, kind, keep, placed, _FINE_STEPS).pose
-    return _finish(mesh, scan, many, pose, surface, placed, keep, doubts)
+    return _finish(mesh, scan, many, chosen._replace(pose=pose), others, surface, placed, keep, doubts)
 
 
 # --------------------------------------------------------------------------------------------------- what is compared
@@ -262,20 +294,21 @@ def _unit_doubt(scan: float, template: float) -> str:
 # ------------------------------------------------------------------------------------------------------------- starts
 
 
-def _starts(template: _Moments, scan: _Moments, kind: Kind) -> list[_Pose]:
+def _starts(template: _Moments, scan: _Moments, kind: Kind) -> list[_Map]:
     """The pose as given comes first."""
     sizes = [1.0] if kind == "rigid" else [1.0, scan.size / template.size]
-    poses = [_Pose(np.eye(3), np.zeros(3))]
+    poses = [_Map(np.eye(3), np.zeros(3))]
     turns = [(size, np.eye(3)) for size in sizes]
-    nearby = Rotation.from_rotvec(_NEARBY * np.concatenate([np.eye(3), -np.eye(3)]), degrees=True).as_matrix()
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    nearby = Rotation.from_rotvec(_NEARBY * np.concatenate([axes, 2 * axes]), degrees=True).as_matrix()
     turns += [(sizes[0], turn) for turn in [*nearby, *_quarter_turns()[1:]]]
     turns += [(sizes[-1], scan.axes @ turn @ template.axes.T) for turn in _quarter_turns()]
     return poses + [_about(size * turn, template, scan) for size, turn in turns]
 
 
-def _about(linear: Float[np.ndarray, "3 3"], template: _Moments, scan: _Moments) -> _Pose:
+def _about(linear: Float[np.ndarray, "3 3"], template: _Moments, scan: _Moments) -> _Map:
     """Takes the template's middle to the scan's."""
-    return _Pose(linear, scan.centre - linear @ template.centre)
+    return _Map(linear, scan.centre - linear @ template.centre)
 
 
 def _quarter_turns() -> list[Float[np.ndarray, "3 3"]]:
@@ -289,7 +322,7 @@ def _quarter_turns() -> list[Float[np.ndarray, "3 3"]]:
     return found
 
 
-def _landmark_pose(placed: Placed, kind: Kind) -> _Pose | None:
+def _landmark_pose(placed: Placed, kind: Kind) -> _Map | None:
     """The map of least squares that takes the landmarks of the template to the scan's; None where many do."""
     weights = placed.weights / placed.weights.sum()
     centres = weights @ placed.mesh, weights @ placed.scan
@@ -301,19 +334,19 @@ def _landmark_pose(placed: Placed, kind: Kind) -> _Pose | None:
     if kind == "affine" and len(x) >= 4 and all(w[2] > 1e-2 * w[0] for w in widths):
         linear = np.linalg.lstsq(root * x, root * y)[0].T
         if np.linalg.det(linear) > 0:
-            return _Pose(linear, centres[1] - linear @ centres[0])
+            return _Map(linear, centres[1] - linear @ centres[0])
     u, s, vt = np.linalg.svd((weights[:, None] * y).T @ x)
     sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])  # of two answers the one that does not mirror
     scale = 1.0 if kind == "rigid" else (s @ sign) / np.sum(widths[0] ** 2)
     linear = scale * (u * sign) @ vt
-    return _Pose(linear, centres[1] - linear @ centres[0])
+    return _Map(linear, centres[1] - linear @ centres[0])
 
 
 # ------------------------------------------------------------------------------------------------------------- search
 
 
 def _search(
-    pose: _Pose,
+    pose: _Map,
     points: Float[np.ndarray, "p 3"],
     surface: _Surface,
     kind: Kind,
@@ -328,15 +361,16 @@ def _search(
         pairs = _pairs(pose, points, surface)
         moved, pose = _step(pose, pairs, _weights(pairs, keep), generators, placed, size)
         if not (0.1 * size < _spread(pose, surface) < 10 * size):
-            return _Found(pose, np.inf)  # shrunk into the scan, or blown up until it is a plane
+            # Shrunk into the scan, or blown up until it is a plane.
+            return _Found(pose, np.inf, np.full(len(points), np.inf))
         if moved < _MOVED:
             break
     distance = np.sort(_pairs(pose, points, surface).distance)
-    return _Found(pose, float(np.sqrt(np.mean(distance[: max(1, round(keep * len(distance)))] ** 2))))
+    return _Found(pose, float(np.sqrt(np.mean(distance[: max(1, round(keep * len(distance)))] ** 2))), distance)
 
 
 def _best_starts(
-    poses: list[_Pose],
+    poses: list[_Map],
     points: Float[np.ndarray, "p 3"],
     surface: _Surface,
     kind: Kind,
@@ -345,16 +379,26 @@ def _best_starts(
 ) -> list[_Found]:
     """The best few after a short search from each; the first pose, the one given, is always among them."""
     found = [_search(pose, points, surface, kind, keep, placed, _FIRST_STEPS) for pose in poses]
-    found = found[:1] + sorted(found[1:], key=lambda one: one.score)[:_COARSE_BEST]
+    found = _best_apart(found, _COARSE_BEST)
     found = [_search(one.pose, points, surface, kind, keep, placed, _COARSE_STEPS) for one in found]
-    return found[:1] + sorted(found[1:], key=lambda one: one.score)[:_REFINED]
+    return _best_apart(found, _REFINED)
 
 
-def _spread(pose: _Pose, surface: _Surface) -> float:
+def _best_apart(found: list[_Found], n: int) -> list[_Found]:
+    """The first, and of the others the best `n` that are turned differently from each other."""
+    apart: list[_Found] = []
+    for one in sorted(found[1:], key=lambda one: one.score):
+        turned = (_angle(one.pose.linear @ np.linalg.inv(other.pose.linear)) for other in apart)
+        if len(apart) < n and all(angle > _SAME_TURN for angle in turned):
+            apart.append(one)
+    return found[:1] + apart
+
+
+def _spread(pose: _Map, surface: _Surface) -> float:
     return float(np.sqrt(pose(surface.points[::50]).var(axis=0).sum()))
 
 
-def _pairs(pose: _Pose, points: Float[np.ndarray, "p 3"], surface: _Surface) -> _Pairs:
+def _pairs(pose: _Map, points: Float[np.ndarray, "p 3"], surface: _Surface) -> _Pairs:
     """Closest samples are sought in the template's frame, so that its tree stays; distances are the scan's."""
     row = surface.tree.query(pose.back(points))[1]
     at = pose(surface.points[row])
@@ -387,13 +431,13 @@ def _generators(kind: Kind) -> Float[np.ndarray, "k 3 3"]:
 
 
 def _step(
-    pose: _Pose,
+    pose: _Map,
     pairs: _Pairs,
     weights: Float[np.ndarray, "p"],
     generators: Float[np.ndarray, "k 3 3"],
     placed: Placed | None,
     size: float,
-) -> tuple[float, _Pose]:
+) -> tuple[float, _Map]:
     """One Gauss-Newton step, and how far it moved in parts of the size."""
     total = weights.sum()
     if total <= 0:
@@ -427,7 +471,7 @@ def _step(
         turn = Rotation.from_rotvec([change[2, 1], change[0, 2], change[1, 0]]).as_matrix()
         turn = turn * np.exp(np.clip(np.trace(change) / 3, -0.3, 0.3))
     moved = float(np.abs(found).max() / size)
-    return moved, _Pose(turn @ pose.linear, turn @ (pose.shift - centre) + centre + shift)
+    return moved, _Map(turn @ pose.linear, turn @ (pose.shift - centre) + centre + shift)
 
 
 # ------------------------------------------------------------------------------------------------------------- doubts
@@ -439,71 +483,125 @@ def _angle(linear: Float[np.ndarray, "3 3"]) -> float:
     return float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
 
 
-def _other_answers(chosen: _Found, fine: list[_Found]) -> list[str]:
+def _near(found: list[_Found]) -> float:
+    """How far from the best of some poses a point still counts as near."""
+    return _NEAR * min(float(np.quantile(one.distances, _SURE)) for one in found)
+
+
+def _other_answers(chosen: _Found, others: list[_Found], share_of_template: float) -> list[Finding]:
     """Two poses far from each other that fit alike: a sphere, say. The pose as given needs no such excuse."""
     if _angle(chosen.pose.linear) < 2 * _NEARBY:
         return []
-    for other in fine:
+    # A scan of a part leaves more poses: one that is clearly worse on the whole may be right on another's body.
+    alike = _ALIKE if share_of_template > _WHOLE else _ALIKE_IN_PART
+    for other in others:
         angle = _angle(other.pose.linear @ np.linalg.inv(chosen.pose.linear))
-        if angle > _FAR_ROTATION and other.score < _ALIKE * chosen.score:
+        if angle > _FAR_ROTATION and other.score < alike * chosen.score:
             return [
-                f"two poses fit alike ({chosen.score:.2g} and {other.score:.2g} mm), {angle:.0f} degrees apart: turn "
-                "the template to about the right pose, or give landmarks."
+                Finding(
+                    "two_poses_alike",
+                    f"two poses fit alike ({chosen.score:.2g} and {other.score:.2g} mm), {angle:.0f} degrees apart: "
+                    "turn the template to about the right pose, or give landmarks.",
+                    {"score": chosen.score, "other": other.score, "apart": angle},
+                )
             ]
     return []
 
 
 def _mirrored(
     mesh: js.ControlMesh, points: np.ndarray, template: _Moments, scan: _Moments, kind: Kind, keep: float
-) -> float:
-    """Score of the best fit to the template seen in a mirror, from the starts that the template itself had."""
+) -> _Found:
+    """The best fit to the template seen in a mirror, from the starts that the template itself had."""
     flip = np.diag([-1.0, 1.0, 1.0])
     surface = _surface(mesh, _COARSE[1])
     x = surface.points @ flip
     surface = surface._replace(points=x, normals=surface.normals @ flip, tree=KDTree(x))
     axes = flip @ template.axes @ np.diag([1.0, 1.0, -1.0])
     poses = _starts(template._replace(centre=flip @ template.centre, axes=axes), scan, kind)
-    return min(found.score for found in _best_starts(poses, points, surface, kind, keep, None))
+    return min(_best_starts(poses, points, surface, kind, keep, None), key=lambda found: found.score)
 
 
 def _finish(
     mesh: js.ControlMesh,
     scan: Scan,
     points: Float[np.ndarray, "q 3"],
-    pose: _Pose,
+    chosen: _Found,
+    others: list[_Found],
     surface: _Surface,
     placed: Placed | None,
     keep: float,
-    doubts: list[str],
+    doubts: list[Finding],
 ) -> Alignment:
     """The record, with the numbers over points drawn from the whole scan."""
+    pose = chosen.pose
     # The limit comes from the cleaned scan, where nearly all points count; the share is of the scan as it came.
-    limit = _COUNTS * np.quantile(_pairs(pose, points, surface).distance, keep)
+    # Where only half of them lie on the template, the nearest 30 % tell.
+    surely, mostly = np.quantile(_pairs(pose, points, surface).distance, [_SURE, keep])
+    limit = min(_COUNTS * mostly, 2 * _COUNTS * surely)
     pairs = _pairs(pose, _rows(np.asarray(scan.points, np.float64), 5000), surface)
     counts = (pairs.distance <= limit) & ~pairs.past_rim
     share = float(counts.mean())
     rms = float(np.sqrt(np.mean(pairs.across[counts] ** 2))) if share else np.inf
     size = _spread(pose, surface)
+    found = _in_words(pose, surface, _rows(np.asarray(scan.points, np.float64), _AT_MOST), limit, share)
     if rms > 0.1 * size:
-        doubts.append(f"the template is {rms:.3g} mm off where it fits best, for a size of {size:.3g} mm.")
+        text = f"the template is {rms:.3g} mm off where it fits best, for a size of {size:.3g} mm."
+        doubts.append(Finding("template_off", text, {"rms": rms, "size": size}))
     if share < 0.25:
-        doubts.append(f"only {100 * share:.0f} % of the scan's points lie near the template.")
+        text = f"only {100 * share:.0f} % of the scan's points lie near the template."
+        doubts.append(Finding("few_points_near_template", text, {"share": share}))
     if placed is not None:
         off = np.linalg.norm(pose(placed.mesh) - placed.scan, axis=1)
         bad = np.flatnonzero((off > 0.2 * size) & (placed.weights > 0))
         if len(bad):
             named = ", ".join(f"{row} ({off[row]:.3g} mm)" for row in bad[:5])
-            doubts.append(f"landmarks far from their place: rows {named}. Were they exchanged, or left and right?")
+            text = f"landmarks far from their place: rows {named}. Were they exchanged, or left and right?"
+            doubts.append(Finding("landmarks_far", text, {"rows": len(bad), "farthest": float(off.max())}))
+    else:
+        doubts += _scale_doubt(found.scaled) + _other_answers(chosen, others, found.share_of_template)
     for doubt in doubts:
-        warnings.warn(f"alignment: {doubt}", stacklevel=3)
+        warnings.warn(f"alignment: {doubt.text}", stacklevel=3)
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = pose.linear, pose.shift
-    return Alignment(transform, put(mesh, transform), rms, share, tuple(doubts))
+    return Alignment(transform, put(mesh, transform), rms, share, tuple(doubts), found)
+
+
+def _in_words(pose: _Map, surface: _Surface, points: Float[np.ndarray, "p 3"], limit: float, share: float) -> Pose:
+    """A map by its turn, scale and shift, and how much of scan and template lie near each other."""
+    scale = float(np.cbrt(np.linalg.det(pose.linear)))
+    turn, _ = polar(pose.linear)
+    middle = surface.points.mean(axis=0, keepdims=True)
+    there = pose(surface.points)
+    # Where points lie far apart, none may be as near to a sample of the template as it is to the surface between them.
+    apart = nearest_rows(KDTree(points), points, min(_APART, len(points)))[0][:, -1]
+    near = KDTree(points).query(there)[0] <= np.hypot(limit, 2 * np.median(apart))
+    moved = float(np.linalg.norm(pose(middle) - middle))
+    return Pose(_angle(turn), scale, moved, share, float(near.mean()))
+
+
+def _scale_doubt(scaled: float) -> list[Finding]:
+    if 1 / _FAR_SCALE <= scaled <= _FAR_SCALE:
+        return []
+    text = (
+        f"the template was scaled by {scaled:.2f} to fit: is it another kind of anatomy, or does the scan show more, "
+        "or less, than the template? Keep its size by --align rigid, or give landmarks."
+    )
+    return [Finding("scaled_far", text, {"scaled": scaled})]
+
+
+def mirror_image(mesh: js.ControlMesh, landmarks: Landmarks | None = None) -> tuple[js.ControlMesh, Landmarks | None]:
+    """The mesh as a mirror shows it, in its place, with its faces wound outwards; and the landmarks on it."""
+    flip, about = np.array([-1.0, 1.0, 1.0]), 2 * mesh.vertices.mean(axis=0) * (1, 0, 0)
+    normals = None if mesh.normals is None else mesh.normals * flip
+    faces = {size: rows[:, ::-1] for size, rows in mesh.faces.items()}
+    if landmarks is not None and np.ndim(landmarks.on_mesh) == 2:
+        landmarks = landmarks._replace(on_mesh=np.asarray(landmarks.on_mesh, np.float64) * flip + about)
+    return js.ControlMesh(mesh.vertices * flip + about, faces, normals), landmarks
 
 
 def put(mesh: js.ControlMesh, transform: Float[np.ndarray, "4 4"]) -> js.ControlMesh:
     """The mesh where an alignment puts it."""
-    pose, normals = _Pose(transform[:3, :3], transform[:3, 3]), mesh.normals
+    pose, normals = _Map(transform[:3, :3], transform[:3, 3]), mesh.normals
     if normals is not None:
         normals = normals @ np.linalg.inv(pose.linear)
         length = np.linalg.norm(normals, axis=1, keepdims=True)

@@ -1,0 +1,76 @@
+"""What the scan itself says of its noise, and what of it the surface explains: numbers that findings are judged by."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
+
+from ..scan.closest_points import nearest_rows
+from ..start.cloud import rows_on_surfaces
+from ..start.orient import plane_fits
+
+_MOST = 20_000  # points that are looked at: an even part of more tells as much
+_NEIGHBOURS = 12
+_LEFT = (_NEIGHBOURS - 3) / _NEIGHBOURS  # of the variance: three numbers of a plane follow from its points
+_PATCH = 40  # points beside each other on the surface that tell one wall from two
+_LEAST_PATCHED = 400
+# Squares of distances over their mean, squared, mean 3 for one Gaussian wall and 1 for two walls far apart; of 40
+# points of one wall a hundredth lies below 1.75, and of two walls four standard deviations apart nearly all.
+_TWO_HUMPS = 1.75
+
+
+class OwnNoise(NamedTuple):
+    """What the scan says of itself, without any surface."""
+
+    sampled: Bool[np.ndarray, "p"]
+    """Points that were looked at: those that count, and are not scattered."""
+    noise: float
+    """Median distance in mm of a point's twelve neighbours from their plane: the noise, or more where they lie so
+    thinly that the surface is not flat between them."""
+    spacing: float
+    """Median distance in mm to the nearest other point."""
+
+
+def own_noise(points: Float[np.ndarray, "p 3"], counted: Bool[np.ndarray, "p"]) -> OwnNoise:
+    """Noise and spacing of the points that are not scattered, each repeated point once.
+
+    Args:
+        points: in mm.
+        counted: those that have a weight.
+    """
+    rows = np.flatnonzero(counted)
+    if len(rows) > _MOST:
+        rows = np.sort(np.random.default_rng(0).choice(rows, _MOST, replace=False))
+    rows = rows[np.sort(np.unique(points[rows], axis=0, return_index=True)[1])]
+    sampled = np.zeros(len(points), bool)
+    if len(rows) > 2 * _NEIGHBOURS:
+        rows = rows[rows_on_surfaces(points[rows])]
+    sampled[rows] = True
+    some = points[rows]
+    if len(rows) < 2:
+        return OwnNoise(sampled, 0.0, 0.0)
+    _, off, _ = plane_fits(some, _NEIGHBOURS)
+    spacing = nearest_rows(KDTree(some), some, 2)[0][:, 1]
+    return OwnNoise(sampled, float(np.median(off)) / _LEFT**0.5, float(np.median(spacing)))
+
+
+def share_of_two_walls(
+    feet: Float[np.ndarray, "p 3"], sides: Float[np.ndarray, "p 3"], distances: Float[np.ndarray, "p"]
+) -> float:
+    """Share of the patches of the surface whose distances have two humps, with hardly a point between them.
+
+    Args:
+        feet: where on the surface each point is paired, in mm.
+        sides: the surface's unit normals there.
+        distances: signed, in mm.
+    """
+    if len(feet) < _LEAST_PATCHED:
+        return 0.0
+    centres = np.arange(0, len(feet), max(1, len(feet) // 1000))
+    _, near = nearest_rows(KDTree(feet), feet[centres], _PATCH)
+    same = np.einsum("cpx,cx->cp", sides[near], sides[centres]) > 0.5
+    of_patch = distances[near] - distances[near].mean(axis=1, keepdims=True)
+    square = of_patch**2
+    kurtosis = np.mean(square**2, axis=1) / np.maximum(square.mean(axis=1) ** 2, np.finfo(float).tiny)
+    return float(np.mean((kurtosis < _TWO_HUMPS) & (same.mean(axis=1) > 0.8)))

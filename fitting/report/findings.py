@@ -1,0 +1,198 @@
+"""What speaks against a fit. A check is one function and its place in `CHECKS`."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import optimistix as optx
+from jaxtyping import Bool, Float
+
+import jaxsubdiv as js
+
+from ..finding import Finding
+from .coverage import at_pairs, unit
+from .evidence import OwnNoise, own_noise, share_of_two_walls
+from .record import Fit
+
+# Each limit lies between the fits that are wrong and those that are right of tests/bench/fit_trust.py.
+_NOISE_OVER_OWN, _NOISE_OVER_EDGE = 3.0, 0.12
+_UNEXPLAINED = 0.1
+_UNSUPPORTED = 0.5
+_TWO_WALLS = 0.25
+_AGAINST, _FACING = 0.05, -0.5
+_JUMP, _LAST = 1.5, 5
+_FOLDED = -0.2
+
+
+class Evidence(NamedTuple):
+    """What the checks look at; lengths in mm."""
+
+    fit: Fit
+    surface: js.RefinedSurface
+    own: OwnNoise
+    edge: float
+    """Length of a control edge, in the middle."""
+    noise: float
+    distances: Float[np.ndarray, "p"]
+    """Of the scan's points, signed."""
+    inliers: Bool[np.ndarray, "p"]
+    feet: Float[np.ndarray, "p 3"]
+    """Where on the surface each point is paired."""
+    sides: Float[np.ndarray, "p 3"]
+    """The surface's unit normals there."""
+    areas: Float[np.ndarray, "v"]
+    """Of the surface's vertices, in mm^2."""
+    covered: Bool[np.ndarray, "v"]
+    """Vertices that the scan covers."""
+
+
+def gather_evidence(
+    fit: Fit, surface: js.RefinedSurface, areas: Float[np.ndarray, "v"], covered: Bool[np.ndarray, "v"]
+) -> Evidence:
+    """All that the checks look at."""
+    look, scattered = fit.look, np.asarray(fit.scene.around.scattered)
+    counted = (np.asarray(fit.scene.scan.weights_or_ones()) > 0) & ~scattered
+    noise, distances = float(look.noise), np.asarray(look.distances, np.float64)
+    return Evidence(
+        fit=fit,
+        surface=surface,
+        own=own_noise(np.asarray(look.pairs.points, np.float64), counted),
+        edge=float(js.edge_length(fit.topology, fit.y.control.vertices)),
+        noise=noise,
+        distances=distances,
+        inliers=np.abs(distances) <= 3 * noise,
+        feet=at_pairs(np.asarray(surface.vertices, np.float64), look),
+        sides=unit(at_pairs(np.asarray(surface.normals, np.float64), look)),
+        areas=areas,
+        covered=covered,
+    )
+
+
+def find_what_speaks_against(seen: Evidence) -> list[Finding]:
+    """The findings about where the fit started, and those of every check."""
+    own = (check(seen) for check in CHECKS)
+    return [*seen.fit.origin.findings, *(finding for finding in own if finding is not None)]
+
+
+def check_convergence(seen: Evidence) -> Finding | None:
+    """Whether the surface came to rest."""
+    if seen.fit.result == optx.RESULTS.successful:
+        return None
+    return Finding(
+        "not_converged",
+        f"the fit did not converge in {len(seen.fit.rms) - 1} sweeps: the surface is where it stopped. Give more "
+        "sweeps or a better start.",
+        {"sweeps": len(seen.fit.rms) - 1},
+    )
+
+
+def check_noise(seen: Evidence) -> Finding | None:
+    """Whether the distances are noise of the scan, or a surface that is wrong."""
+    over_own, over_edge = seen.noise / max(seen.own.noise, 1e-9 * seen.edge), seen.noise / seen.edge
+    if over_own < _NOISE_OVER_OWN or over_edge < _NOISE_OVER_EDGE:
+        return None
+    return Finding(
+        "noise_above_the_scans_own",
+        f"the distances to the surface, {seen.noise:.3g} mm, are taken for noise, but neighbouring points of the scan "
+        f"lie within {seen.own.noise:.2g} mm of a plane, {over_own:.1f} times less. The surface misses what the scan "
+        "shows: look at the worst places; give more faces, or a better start.",
+        {"noise": seen.noise, "own_noise": seen.own.noise, "edge": seen.edge},
+    )
+
+
+def check_unexplained_points(seen: Evidence) -> Finding | None:
+    """Whether points that lie on some surface lie on this one."""
+    there = seen.own.sampled
+    off = there & ~seen.inliers
+    share = float(off.sum() / max(there.sum(), 1))
+    if share < _UNEXPLAINED:
+        return None
+    far, at = float(np.median(np.abs(seen.distances[off]))), seen.feet[off].mean(axis=0)
+    return Finding(
+        "points_unexplained",
+        f"{share:.0%} of the points that are not scattered lie off the surface by more than 3 x the noise, half of "
+        f"them by over {far:.3g} mm, around ({_place(at)}). Does the scan show another object, or "
+        "a part that the control mesh lacks?",
+        {"share": share, "median_distance": far},
+    )
+
+
+def check_unsupported_surface(seen: Evidence) -> Finding | None:
+    """Whether most of the surface has points."""
+    total = seen.areas.sum()
+    share = float(seen.areas[~seen.covered].sum() / total) if total > 0 else 1.0
+    if share < _UNSUPPORTED:
+        return None
+    bare = np.asarray(seen.surface.vertices, np.float64)[~seen.covered].mean(axis=0)
+    return Finding(
+        "surface_unsupported",
+        f"{share:.0%} of the surface has no point of the scan near, around ({_place(bare)}): "
+        "there it follows from the template and the priors alone.",
+        {"share": share},
+    )
+
+
+def check_two_walls(seen: Evidence) -> Finding | None:
+    """Whether the surface lies between two layers of points."""
+    kept = seen.inliers & seen.own.sampled
+    share = share_of_two_walls(seen.feet[kept], seen.sides[kept], seen.distances[kept])
+    if share < _TWO_WALLS:
+        return None
+    return Finding(
+        "two_walls",
+        f"on {share:.0%} of the surface the points lie in two layers, {2 * seen.noise:.3g} mm apart, and the surface "
+        "between them. Keep one of the walls, by labels or normals.",
+        {"share": share, "apart": 2 * seen.noise},
+    )
+
+
+def check_facing(seen: Evidence) -> Finding | None:
+    """Whether the scan's normals point as the surface's do."""
+    normals = seen.fit.scan.normals
+    if normals is None:
+        return None
+    own = np.asarray(normals, np.float64)
+    there = seen.inliers & (own != 0).any(axis=1)
+    if not there.any():
+        return None
+    cosine = np.einsum("px,px->p", unit(own[there]), seen.sides[there])
+    share = float(np.mean(cosine * np.sign(cosine.sum()) < _FACING))  # outside is the side that most points are on
+    if share < _AGAINST:
+        return None
+    return Finding(
+        "points_face_against",
+        f"the normals of {share:.0%} of the points face against the surface where they lie on it: they may show the "
+        "other side of something thin.",
+        {"share": share},
+    )
+
+
+def check_jumps(seen: Evidence) -> Finding | None:
+    """Whether the distances fell, and stayed down."""
+    rms = seen.fit.robust_rms[1:]
+    if len(rms) < 2:
+        return None
+    last = float(rms[-_LAST:].max() / max(rms.min(), np.finfo(float).tiny))
+    if last < _JUMP or rms.min() <= 0:
+        return None
+    return Finding(
+        "distances_jump",
+        f"the RMS distance rose again, to {last:.1f} times its least over the sweeps: the last surface is not the best "
+        "one. Give a better start, or fewer faces.",
+        {"ratio": last},
+    )
+
+
+def _place(at: Float[np.ndarray, "3"]) -> str:
+    return ", ".join(f"{x:.0f}" for x in at)
+
+
+CHECKS: tuple[Callable[[Evidence], Finding | None], ...] = (
+    check_convergence,
+    check_noise,
+    check_unexplained_points,
+    check_unsupported_surface,
+    check_two_walls,
+    check_facing,
+    check_jumps,
+)
