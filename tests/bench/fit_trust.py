@@ -433,16 +433,10 @@ def run(name: str, shared: Path, folder: Path | None) -> tuple[str, str]:
     if folder is not None:
         result.save(folder / name.replace(": ", "_").replace(" ", "_").replace(",", ""))
     told = ", ".join(names)
-    judged = "wrong" if wrong else "right"
-    verdict = {
-        (True, True): "hit",
-        (True, False): "**MISSED**",
-        (False, True): "*false alarm*",
-        (False, False): "quiet",
-    }
-    seconds = time.perf_counter() - began
-    print(f"{seconds:.0f} s", file=sys.stderr)
-    return f"| {name} | {judged} | {off} | {told} | {verdict[wrong, bool(names)]} |", wrong, names
+    kinds = {(True, True): "hit", (True, False): "MISSED", (False, True): "false alarm", (False, False): "quiet"}
+    kind = kinds[wrong or given.deserves_a_word, bool(names)]
+    print(f"{time.perf_counter() - began:.0f} s", file=sys.stderr)
+    return f"| {name} | {'wrong' if wrong else 'right'} | {off} | {told} | {kind} |", kind
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
