@@ -172,14 +172,15 @@ def check_jumps(seen: Evidence) -> Finding | None:
     rms = seen.fit.robust_rms[1:]
     if len(rms) < 2:
         return None
-    last = float(rms[-_LAST:].max() / max(rms.min(), np.finfo(float).tiny))
-    if last < _JUMP or rms.min() <= 0:
+    last = rms[-_LAST:]
+    ratio = float(last.max() / max(last.min(), np.finfo(float).tiny))
+    if ratio < _JUMP:
         return None
     return Finding(
         "distances_jump",
-        f"the RMS distance rose again, to {last:.1f} times its least over the sweeps: the last surface is not the best "
-        "one. Give a better start, or fewer faces.",
-        {"ratio": last},
+        f"the RMS distance was {ratio:.1f} times as large in one of the last sweeps as in another: the surface has not "
+        "come to rest. Give a better start, or fewer faces.",
+        {"ratio": ratio},
     )
 
 

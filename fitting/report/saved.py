@@ -33,6 +33,7 @@ from .record import Fit
 _VERSIONS = (3, 4)  # 1 had no likeness, 2 not what held the unknowns; 4 has strengths and shared unknowns by name
 _FIT, _RECIPE = "fit.npz", "recipe.json"
 _ENDS = ("successful", "nonlinear_max_steps_reached", "nonlinear_divergence", "nonfinite")
+_OF_SCAN = ("points", "normals", "weights", "deviations", "slices")
 _A_POINT = ("face", "uv", "directions", "distances", "weights", "precisions")
 
 
@@ -75,8 +76,8 @@ def save_fit(folder: str | os.PathLike[str], fit: Fit, recipe: Settings) -> None
     }
     arrays |= {f"strength_{name}": value for name, value in fit.strengths.values.items()}
     arrays |= {f"shared_{name}": value for name, value in fit.y.shared.items()}
-    for name, value in vars(fit.scan).items():
-        arrays[f"scan_{name}"] = value
+    for name in _OF_SCAN:
+        arrays[f"scan_{name}"] = getattr(fit.scan, name)
     inputs = fit.inputs
     arrays["alike"] = inputs.get("alike")
     if inputs.get("landmarks") is not None:
@@ -178,8 +179,7 @@ def _restore(arrays: dict[str, np.ndarray]) -> Fit:
     scheme = settings.scheme
     topology = settings.topology(js.ControlMesh(arrays["template"], {3: arrays["triangles"], 4: arrays["quads"]}))
     start = js.Control(on_device("template"), on_device("start_normals"))
-    of_scan = ("points", "normals", "weights", "deviations", "slices")
-    scan = Scan(**{name: arrays.get(f"scan_{name}") for name in of_scan})
+    scan = Scan(**{name: arrays.get(f"scan_{name}") for name in _OF_SCAN})
     inputs: dict[str, Any] = {"alike": arrays.get("alike")}
     if "anchor_points" in arrays:
         inputs["landmarks"] = Anchors(*(on_device(f"anchor_{name}") for name in Anchors._fields))

@@ -276,6 +276,7 @@ def _fill_scene(scene: Scene, size: int, has_slices: bool) -> Scene:
         fill(scan.weights_or_ones(), constant_values=0),
         fill(scan.relative_deviations(), constant_values=1),
         None,
+        None,
     )
     whole = eqx.tree_at(lambda s: tuple(vars(s).values()), scan, values, is_leaf=lambda leaf: leaf is None)
     around = type(scene.around)(*(fill(rows) for rows in scene.around))

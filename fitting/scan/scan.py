@@ -32,6 +32,13 @@ def _optional_whole(value: object) -> Array | None:
     return jnp.asarray(values, jnp.int32)
 
 
+def _optional_faces(value: object) -> np.ndarray | None:
+    faces = None if value is None else np.asarray(value)
+    if faces is not None and (faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu"):
+        raise ScanError(f"`faces` must be triangles, rows of three points [t, 3]; got {list(faces.shape)}.")
+    return None if faces is None or not len(faces) else faces.astype(np.int32)
+
+
 class Scan(eqx.Module):
     """Measured points of a surface.
 
@@ -43,6 +50,8 @@ class Scan(eqx.Module):
             counts: how large the noise is, the fit finds out.
         slices: the number of the slice that each point lies in, or None where the scan is not made of slices. `fit`
             shifts each within its plane.
+        faces: triangles between the points `[t, 3]`, or None. A control mesh made from the scan takes its sides from
+            them, its parts, and whether it is closed; `fit` looks at the points alone.
 
     Raises:
         ScanError: there is no point, a value is not finite, a weight is negative, a deviation is not positive, a
@@ -54,6 +63,7 @@ class Scan(eqx.Module):
     weights: Float[Array, "p"] | None = eqx.field(converter=_optional, default=None)
     deviations: Float[Array, "p"] | None = eqx.field(converter=_optional, default=None)
     slices: Int[Array, "p"] | None = eqx.field(converter=_optional_whole, default=None)
+    faces: Int[np.ndarray, "t 3"] | None = eqx.field(converter=_optional_faces, default=None)
 
     def __check_init__(self):
         if self.points.ndim != 2 or self.points.shape[-1] != 3 or len(self.points) == 0:
@@ -72,6 +82,8 @@ class Scan(eqx.Module):
             finite = np.isfinite(np.asarray(values)).reshape(len(values), -1).all(axis=1)
             if not finite.all():
                 raise ScanError(f"`{name}` are not finite in rows {name_rows(np.flatnonzero(~finite))}. Drop the rows.")
+        if self.faces is not None and not (0 <= self.faces.min() and self.faces.max() < len(self.points)):
+            raise ScanError(f"`faces` name points that there are not: the scan has {len(self.points)}.")
         if self.weights is not None:
             negative = np.flatnonzero(np.asarray(self.weights) < 0)
             if len(negative):
@@ -103,7 +115,13 @@ class Scan(eqx.Module):
 
     def rows(self, chosen: Bool[np.ndarray, "p"] | Int[np.ndarray, "q"]) -> "Scan":
         """Some of the points, with all that is known of each."""
-        return Scan(**{name: None if value is None else value[chosen] for name, value in vars(self).items()})
+        own = {name: value for name, value in vars(self).items() if name != "faces" and value is not None}
+        faces = None
+        if self.faces is not None:
+            new = np.full(self.n_points, -1)
+            new[chosen] = np.arange(len(new[chosen]))
+            faces = new[self.faces][(new[self.faces] >= 0).all(axis=1)]
+        return Scan(**{name: value[chosen] for name, value in own.items()}, faces=faces)
 
     def without_slices(self) -> "Scan":
         """The same points, each for itself."""

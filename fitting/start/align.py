@@ -148,9 +148,9 @@ def align(
 
     Starts are the pose as given, the same moved onto the scan's middle, turned there by 30 and 60 degrees and with its
     axes in every other order, and the 24 proper ways to lay the principal axes of the template on the scan's; or the
-    landmarks alone, where they fix a pose. From each a short trimmed ICP runs on few points; the best ones are refined, point to
-    plane with Tukey's weights. A pose near the given one is taken unless another is clearly better. Scattered outliers
-    are dropped first. The same input gives the same answer.
+    landmarks alone, where they fix a pose. From each a short trimmed ICP runs on few points; the best ones are refined,
+    point to plane with Tukey's weights. A pose near the given one is taken unless another is clearly better. Scattered
+    outliers are dropped first. The same input gives the same answer.
 
     Args:
         mesh: the template, open or closed. Its flat faces are what the scan is compared with.

@@ -3,13 +3,14 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from ..scan.closest_points import nearest_rows
 from ..scan.outliers import neighbour_distance, one_a_cell
 from ..scan.scan import Scan, ScanError
 from ..scan.slices import contour_spacing
+from .mesh_topology import component_labels
 from .orient import flipped, orient, plane_fits
 from .poisson import Implicit, poisson
 
@@ -25,6 +26,7 @@ _THIN, _THICK = 1.7, 0.15
 # Neighbours on lines, or so much denser in one place than in another, tell of no surface: the points are thinned.
 _LINES, _UNEVEN = 0.1, 6.0
 _THINNINGS, _WIDER = 12, 1.4
+_LARGE, _MOST_OF_IT = 0.05, 0.8  # shares of the points: of a component, and of all large ones
 
 
 class Cloud(NamedTuple):
@@ -37,6 +39,9 @@ class Cloud(NamedTuple):
     noise: float
     given: bool
     """Whether the normals are the scan's own."""
+    label: Int[np.ndarray, "p"] | None = None
+    """Of scans with faces the component that each point lies in, where there are several large ones; -1 in a small one.
+    None of all others."""
 
     @property
     def spacing(self) -> float:
@@ -53,6 +58,9 @@ def clean(scan: Scan) -> Cloud:
     points = np.asarray(scan.points, np.float64)
     given = None if scan.normals is None else np.asarray(scan.normals, np.float64)
     used = np.ones(len(points), bool) if scan.weights is None else np.asarray(scan.weights) > 0
+    if scan.faces is not None:
+        used &= np.bincount(scan.faces.ravel(), minlength=len(points)) > 0
+        given = normals_of_faces(points, scan.faces) if given is None else given
     rows = np.flatnonzero(used)
     rows = rows[np.sort(np.unique(points[rows], axis=0, return_index=True)[1])]  # what was written twice counts once
     if len(rows) > _AT_MOST:
@@ -61,20 +69,49 @@ def clean(scan: Scan) -> Cloud:
     if scan.slices is not None:
         _check_slices(points[rows], np.asarray(scan.slices)[rows])
     rows = rows[_even_rows(points[rows])]
-    return clean_points(points[rows], None if given is None else given[rows])
+    label = None if scan.faces is None else _large_components(scan.faces, points, used)
+    return clean_points(points[rows], None if given is None else given[rows], None if label is None else label[rows])
 
 
-def clean_points(points: Float[np.ndarray, "p 3"], given: Float[np.ndarray, "p 3"] | None) -> Cloud:
+def _large_components(
+    faces: Int[np.ndarray, "t 3"], points: Float[np.ndarray, "p 3"], used: Bool[np.ndarray, "p"]
+) -> Int[np.ndarray, "p"] | None:
+    """Which points hang together by faces; points that were written twice are one."""
+    _, same = np.unique(points, axis=0, return_inverse=True)
+    corners = same.ravel()[faces]
+    label = component_labels(np.concatenate([corners[:, :2], corners[:, 1:]]), len(points))[same.ravel()]
+    counts = np.bincount(label[used], minlength=label.max() + 1)
+    large = np.flatnonzero(counts > _LARGE * used.sum())
+    if len(large) < 2 or counts[large].sum() < _MOST_OF_IT * used.sum():
+        return None
+    return np.where(np.isin(label, large), label, -1)
+
+
+def normals_of_faces(points: Float[np.ndarray, "p 3"], faces: Int[np.ndarray, "t 3"]) -> Float[np.ndarray, "p 3"]:
+    """Of every point the sum of its faces' vector areas; zero where it has none."""
+    a, b, c = np.moveaxis(points[faces], 1, 0)
+    areas, normals = np.cross(b - a, c - a), np.zeros_like(points)
+    for corner in faces.T:
+        np.add.at(normals, corner, areas)
+    return normals
+
+
+def clean_points(
+    points: Float[np.ndarray, "p 3"],
+    given: Float[np.ndarray, "p 3"] | None,
+    label: Int[np.ndarray, "p"] | None = None,
+) -> Cloud:
     """The same of points that lie about evenly.
 
     Args:
         points: in mm.
         given: outward normals of any length; used where nine tenths of the points have one.
+        label: see `Cloud`.
     """
     rows = rows_on_surfaces(points)
     if len(rows) < LEAST_POINTS:
         raise ScanError("no surface: the points are scattered in space. Was the right file read?")
-    points = points[rows]
+    points, label = points[rows], None if label is None else label[rows]
     reach = neighbour_distance(points, NEIGHBOUR)
     _, off, _ = plane_fits(points)
     noise = float(np.median(off))
@@ -82,14 +119,14 @@ def clean_points(points: Float[np.ndarray, "p 3"], given: Float[np.ndarray, "p 3
     normals, _, near = plane_fits(points, int(np.clip(16 * (noise / (0.12 * np.median(reach))) ** 2, 16, 60)))
     if given is not None and (given[rows] != 0).any(axis=1).mean() > 0.9:
         normals = np.where(flipped(normals, given[rows])[:, None], -normals, normals)
-        return Cloud(points, normals, reach, noise, True)
+        return Cloud(points, normals, reach, noise, True, label)
     # A tree may turn all of what lies past a crease over, and no later step undoes that: of three ways to begin the one
     # whose surface follows its normals best is taken.
     away = points - points.mean(axis=0)
     starts = [orient(points, normals, near, across) for across in (True, False)]
     starts.append(np.where(flipped(normals, away)[:, None], -normals, normals))
     cell = max(float(np.ptp(points, axis=0).max()) / COARSE_CELLS, noise)
-    settled = [settle(Cloud(points, start, reach, noise, False), cell) for start in starts]
+    settled = [settle(Cloud(points, start, reach, noise, False, label), cell) for start in starts]
     return max(settled, key=_agreement)[0]
 
 

@@ -4,7 +4,7 @@ import warnings
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
 from ..finding import Finding
@@ -36,6 +36,12 @@ def find_parts(cloud: Cloud, closed: bool | None) -> list[Part]:
     A Poisson surface of two objects at once may lose one: normals that are turned wrongly cancel. So what of the points
     lies on no part is looked at again, for itself.
     """
+    if cloud.label is not None:
+        clouds = [
+            _some_of(cloud, cloud.label == one)._replace(label=None) for one in np.unique(cloud.label) if one >= 0
+        ]
+        found = [part for one in clouds for part in find_parts(one, closed)]
+        return sorted(found, key=lambda part: -part.dense.areas.sum())
     parts: list[Part] = []
     rest, n = _turned_outwards(cloud) if cloud.given else cloud, len(cloud.points)
     while len(parts) < _MOST_PARTS:
@@ -46,7 +52,7 @@ def find_parts(cloud: Cloud, closed: bool | None) -> list[Part]:
         for i, dense in enumerate(found.pieces):
             here, it = found.cloud, own == i
             if it.sum() >= LEAST_POINTS or not parts:
-                cut = here._replace(points=here.points[it], normals=here.normals[it], reach=here.reach[it])
+                cut = _some_of(here, it)
                 topology = found.topology if i == 0 else face_topology({3: dense.faces, 4: np.zeros((0, 4), np.int64)})
                 parts.append(Part(cut, dense, topology))
         beside = _nearest_piece(rest.points, rest.reach, found.pieces) < 0
@@ -57,6 +63,11 @@ def find_parts(cloud: Cloud, closed: bool | None) -> list[Part]:
         except ScanError:
             break  # scattered
     return sorted(parts, key=lambda part: -part.dense.areas.sum())
+
+
+def _some_of(cloud: Cloud, chosen: Bool[np.ndarray, "p"]) -> Cloud:
+    points, normals, reach = (rows[chosen] for rows in (cloud.points, cloud.normals, cloud.reach))
+    return cloud._replace(points=points, normals=normals, reach=reach)
 
 
 def choose(parts: list[Part], kind: PartKind | None) -> tuple[list[Part], list[Part], tuple[Finding, ...]]:
