@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
+from jax.core import Tracer
 
 
 class _Limit(NamedTuple):
@@ -25,7 +25,7 @@ _SCALE = _Limit("it is a factor of coordinates, from 1e-9 to 1e9", 1e-9, 1e9)
 _LIMITS = {
     "levels": _Limit("a fit needs a topology of one level or more, and of 8 at most", 1, 8, whole=True),
     "max_sweeps": _Limit("it is a whole number, from 0 to 100,000", 0, 1e5, whole=True),
-    "tolerance": _Limit("it is a part of the surface's uncertainty, from 1e-12 to 1e3", 1e-12, 1e3),
+    "tolerance": _Limit("it is a part of the surface's uncertainty, from 0, for all sweeps, to 1e3", 0, 1e3),
     "tolerance_mm": _LENGTH,
     "faces": _FACES,
     "most_faces": _FACES,
@@ -57,7 +57,7 @@ def check_numbers(numbers: Mapping[str, Any], names: Mapping[str, str] | None = 
         ValueError: one does not; the text names it, and says what it may be.
     """
     for name, value in numbers.items():
-        if value is None or isinstance(value, jax.core.Tracer):  # whose value is not known yet
+        if value is None or isinstance(value, Tracer):  # whose value is not known yet
             continue
         limit, given = _LIMITS[name], np.asarray(value)
         kinds = "iu" if limit.whole else "iuf"

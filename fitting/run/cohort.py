@@ -288,8 +288,7 @@ def _fill_scene(scene: Scene, size: int, has_slices: bool) -> Scene:
     strokes = scene.strokes
     if strokes is not None:
         strokes = strokes._replace(nearest=fill(strokes.nearest), most=jnp.asarray(strokes.most, scan.points.dtype))
-    part = jnp.asarray(n / size, scan.points.dtype)
-    return Scene(whole, around, strokes, of_points, jnp.asarray(scene.open_vertices), part)
+    return Scene(whole, around, strokes, of_points, jnp.asarray(scene.open_vertices))
 
 
 def _split_common(subjects: list[Any]) -> tuple[Any, Any]:
