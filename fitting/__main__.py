@@ -4,10 +4,11 @@ import argparse
 import csv
 import dataclasses
 import io
-import json
 import os
 import sys
 import time
+import traceback
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple, get_args
@@ -19,22 +20,28 @@ import numpy as np
 
 import jaxsubdiv as js
 from jaxsubdiv import SCHEMES
-from jaxsubdiv.console import plain_warnings
+from jaxsubdiv.console import lasting_streams, plain_warnings, printable
 from jaxsubdiv.files import replacing
 
+from .model.limits import check_numbers
 from .model.priors.boundary import BoundaryCurve, boundary_of
 from .report.page import write_page
 from .report.picture import draw_fit, surface_distances
 from .report.result import FitResult
-from .run.fit import CHECKPOINT, Sweep
-from .run.fit_scan import CHECKPOINT_START, ScanFit, misfit
+from .report.saved import read_marks, save_fit
+from .run.checkpoint import differing, marks_of
+from .run.fit import Sweep
+from .run.fit_scan import ScanFit, misfit
+from .run.folder import FIT, filling, is_unfinished, working_in
+from .run.names import SUMMARY, find_scans, name_folders
 from .run.recipe import Recipe, load, load_recipe
 from .scan.example import Example, example
 from .scan.landmarks import Landmarks, match_landmarks, read_landmarks
 from .scan.scan import Scan, read_scan
 
 _EXAMPLE_NOISE = 3.0  # mm: the example starts from a control mesh that is wrong, to show that the fit mends it
-_SCAN_FILES = {".ply", ".xyz", ".csv", ".txt", ".npz", ".vtp", ".vtk", ".stl", ".obj", ".off", ".gii"}
+# What a scan, a file or a fit may be refused by, each with words of its own.
+_REFUSALS = (js.MeshError, ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError)
 _SUMMARY = (
     "scan",
     "status",
@@ -60,6 +67,11 @@ class _Job(NamedTuple):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; exit status 0, 1 where a fit did not converge, 2 where an input cannot be used, 130 stopped."""
+    with lasting_streams(), plain_warnings():
+        return _main(arguments)
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     if options.control and not options.scans:
@@ -67,22 +79,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.labels and not options.scans:
         parser.error("labels are those of a scan: give SCAN before --labels, which takes all the words that follow")
     _keep_what_serves_again()
-    with plain_warnings():
-        try:
-            scans, recipe = _scan_files([Path(scan) for scan in options.scans]), _recipe(options)
-        except (ValueError, OSError) as error:
-            print(f"error: {error}", file=sys.stderr)
-            return 2
-        try:
-            if len(scans) > 1:
-                return _run_all(scans, options, recipe)
-            scan = scans[0] if scans else None
-            folder = Path(options.output or f"fit_{scan.stem if scan else options.example}")
-            return _run(scan, folder, options, recipe)["status"]
-        except KeyboardInterrupt:
-            skips = "; with --resume it skips the scans that are done" if len(scans) > 1 else ""
-            print(f"\nstopped  the same command goes on from the last sweep{skips}", file=sys.stderr)
-            return 130
+    try:
+        _check_options(options)
+        scans, recipe = find_scans([Path(scan) for scan in options.scans]), _recipe(options)
+    except (ValueError, OSError) as error:
+        return _fail(error)
+    try:
+        if len(scans) > 1:
+            return _run_all(scans, options, recipe)
+        scan = scans[0] if scans else None
+        folder = Path(options.output or f"fit_{scan.stem if scan else options.example}")
+        return _run(scan, folder, options, recipe, scan.name if scan else options.example)["status"]
+    except KeyboardInterrupt:
+        skips = "; with --resume it skips the scans that are done" if len(scans) > 1 else ""
+        print(f"\nstopped  the same command goes on from the last sweep{skips}", file=sys.stderr)
+        return 130
+
+
+def _check_options(options: argparse.Namespace) -> None:
+    """See that numbers lie in their ranges, and name them as they were typed."""
+    names = {"tolerance_mm": "tolerance", "most_points": "points"}
+    names |= {name: name for name in ("levels", "max_sweeps", "faces", "symmetry", "likeness", "h")}
+    names |= {name: name for name in ("scale", "control_scale")}
+    typed = {name: f"--{option.replace('_', '-')}" for name, option in names.items()}
+    check_numbers({name: getattr(options, option) for name, option in names.items()}, typed)
 
 
 def _recipe(options: argparse.Namespace) -> Recipe:
@@ -107,59 +127,91 @@ def _recipe(options: argparse.Namespace) -> Recipe:
 def _run_all(scans: list[Path], options: argparse.Namespace, recipe: Recipe) -> int:
     """Every scan into a folder of its own, going on after a failure, and a table of all."""
     parent = Path(options.output or "fits")
-    rows, table = [], io.StringIO()
-    for number, scan in enumerate(scans, 1):
-        print(f"\n[{number}/{len(scans)}] {scan}")
-        rows.append(_run(scan, parent / _unique_name(scan, scans), options, recipe))
-        parent.mkdir(parents=True, exist_ok=True)
-        table = io.StringIO()
-        writer = csv.DictWriter(table, _SUMMARY, restval="", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-        with replacing(parent / "summary.csv") as path:  # after every scan: the run may be stopped
-            path.write_text(table.getvalue(), encoding="utf-8")
-    print(f"\n{table.getvalue()}\nwrote    {parent / 'summary.csv'}")
+    counts = Counter(scan.name for scan in scans)
+    titles = [scan.name if counts[scan.name] == 1 else str(scan) for scan in scans]
+    rows, summary = [], ""
+    try:
+        with working_in(parent):
+            for number, (scan, title, name) in enumerate(zip(scans, titles, name_folders(scans), strict=True), 1):
+                print(f"\n[{number}/{len(scans)}] {scan}")
+                rows.append(_run(scan, parent / name, options, recipe, title))
+                summary = _as_csv(rows)
+                _write_summary(parent / SUMMARY, summary)  # after every scan: the run may be stopped
+    except (ValueError, OSError) as error:
+        return _fail(error)
+    print(f"\n{summary}\nwrote    {parent / SUMMARY}")
     failed = [row["scan"] for row in rows if row["status"]]
     if failed:
         print(f"{len(failed)} of {len(rows)} did not end well: {', '.join(failed)}", file=sys.stderr)
     return max(row["status"] for row in rows)
 
 
-def _run(scan: Path | None, folder: Path, options: argparse.Namespace, recipe: Recipe) -> dict:
-    """One fit: its row of the summary, whose status is 0, 1 for one that did not converge, 2 for one that failed."""
-    name = scan.name if scan else options.example
-    began = time.perf_counter()
+def _fail(error: BaseException) -> int:
+    """Tell why an input cannot be used: exit status 2."""
+    print(f"error: {str(error) or type(error).__name__}", file=sys.stderr)
+    return 2
+
+
+def _as_csv(rows: list[dict]) -> str:
+    table = io.StringIO()
+    writer = csv.DictWriter(table, _SUMMARY, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return table.getvalue()
+
+
+def _write_summary(path: Path, summary: str) -> None:
+    """Tell where that fails, and go on: the fits of the next scans do not depend on it."""
     try:
-        job = _inputs(scan, options)
-        slices = "" if job.scan.slices is None else f" in {len(np.unique(job.scan.slices))} slices"
-        print(f"scan     {job.scan.n_points:,} points{slices}, {_size(np.asarray(job.scan.points))}")
-        done = _done(folder, job.scan, recipe) if options.resume else None
-        if done is not None:
-            print(f"done     before, in {folder}")
-            return _row(name, done, misfit(done), None)
-        if job.mesh is not None:
-            print(
-                f"control  {len(job.mesh.vertices):,} vertices, {job.mesh.n_faces:,} faces, {_size(job.mesh.vertices)}"
-            )
-        with _Progress(recipe.max_sweeps) as progress:
-            found = recipe.fit_scan(
-                job.scan,
-                job.mesh,
-                landmarks=job.landmarks,
-                boundary=job.boundary,
-                on_stage=progress.stage,
-                throw=False,
-                on_sweep=progress.update,
-                checkpoint=folder,
-            )
-        seconds = time.perf_counter() - began
-        report, off = found.result.report(uncertainty=True), misfit(found.result)
-        print(f"done     in {seconds:.1f} s{_ending(found, off)}\n\n{report}\n")
-        _save(folder, found, name)
-    except (js.MeshError, ValueError, TypeError, OSError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return {"scan": name, "status": 2, "seconds": f"{time.perf_counter() - began:.1f}"}
-    return _row(name, found.result, off, seconds)
+        with replacing(path) as unfinished:
+            unfinished.write_text(summary, encoding="utf-8")
+    except OSError as error:
+        _fail(error)
+
+
+def _run(scan: Path | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str) -> dict:
+    """One fit: its row of the summary, whose status is 0, 1 for one that did not converge, 2 for one that failed."""
+    title, began = printable(title), time.perf_counter()
+    try:
+        with working_in(folder):
+            return _fit(scan, folder, options, recipe, title)
+    except _REFUSALS as error:
+        status = _fail(error)
+    except (Exception, SystemExit) as error:  # a fault of this software or another: it must not end the other fits
+        traceback.print_exc()
+        status = _fail(error)
+    return {"scan": title, "status": status, "seconds": f"{time.perf_counter() - began:.1f}"}
+
+
+def _fit(scan: Path | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str) -> dict:
+    began = time.perf_counter()
+    job = _inputs(scan, options)
+    slices = "" if job.scan.slices is None else f" in {len(np.unique(job.scan.slices))} slices"
+    print(f"scan     {job.scan.n_points:,} points{slices}, {_size(np.asarray(job.scan.points))}")
+    marks = _marks(job, recipe)
+    done = _done(folder, marks) if options.resume else None
+    if done is not None:
+        print(f"done     before, in {folder}")
+        return _row(title, done, misfit(done), None)
+    if job.mesh is not None:
+        print(f"control  {len(job.mesh.vertices):,} vertices, {job.mesh.n_faces:,} faces, {_size(job.mesh.vertices)}")
+    with _Progress(recipe.max_sweeps) as progress:
+        found = recipe.fit_scan(
+            job.scan,
+            job.mesh,
+            landmarks=job.landmarks,
+            boundary=job.boundary,
+            on_stage=progress.stage,
+            throw=False,
+            on_sweep=progress.update,
+            checkpoint=folder,
+            keep_checkpoint=True,
+        )
+    seconds = time.perf_counter() - began
+    report, off = found.result.report(uncertainty=True), misfit(found.result)
+    print(f"done     in {seconds:.1f} s{_ending(found, off)}\n\n{report}\n")
+    _save(folder, found, title, marks)
+    return _row(title, found.result, off, seconds)
 
 
 def _row(name: str, result: FitResult, off: float, seconds: float | None) -> dict:
@@ -177,27 +229,30 @@ def _row(name: str, result: FitResult, off: float, seconds: float | None) -> dic
     }
 
 
-def _done(folder: Path, scan: Scan, recipe: Recipe) -> FitResult | None:
+def _marks(job: _Job, recipe: Recipe) -> dict[str, str]:
+    """What tells this fit from any other, by the names of what went in."""
+    inputs = {f"{name} of the scan": value for name, value in vars(job.scan).items()}
+    inputs["control mesh"] = None if job.mesh is None else (job.mesh.vertices, job.mesh.faces, job.mesh.normals)
+    inputs |= {"landmarks": job.landmarks, "boundary": job.boundary}
+    return marks_of(inputs | {field.name: getattr(recipe, field.name) for field in dataclasses.fields(recipe)})
+
+
+def _done(folder: Path, marks: dict[str, str]) -> FitResult | None:
     """The fit in a folder that would come out again; None where there is none, or one that was stopped.
 
     Raises:
-        ValueError: there is one of other points or with other settings.
+        ValueError: there is one of other inputs, or it does not say of which.
     """
-    unfinished = any((folder / name).exists() for name in (CHECKPOINT, CHECKPOINT_START))
-    if unfinished or not (folder / "fit.npz").exists():
+    if is_unfinished(folder) or not (folder / FIT).exists():
         return None
-    done = load(folder)
-    assert done.recipe is not None
-    then, now = (json.loads(one.to_json()) for one in (done.recipe, recipe))
-    others = [name for name in now if then[name] != now[name]]
-    if not np.array_equal(done.scan.points, scan.points):
-        others.append("points of the scan")
-    if others:
+    then = read_marks(folder)
+    others = f"with another {', another '.join(differing(then, marks))}" if then else "that does not say of what"
+    if then != marks:
         raise ValueError(
-            f"{folder} holds a fit with another {', another '.join(others)}. Without --resume it is fitted anew and "
-            "replaced; or give another folder with -o."
+            f"{folder} holds a fit {others}. Without --resume it is fitted anew and replaced; or give another folder "
+            "with -o."
         )
-    return done
+    return load(folder)
 
 
 def _inputs(scan: Path | None, options: argparse.Namespace) -> _Job:
@@ -239,24 +294,23 @@ def _ending(found: ScanFit, off: float) -> str:
     return f"; split {found.splits} times, {found.outcome}: the surface is {off:.3f} mm off the scan beside the noise"
 
 
-def _save(folder: Path, found: ScanFit, name: str) -> None:
-    """The fit as files, each complete or not there at all."""
+def _save(folder: Path, found: ScanFit, title: str, marks: dict[str, str]) -> None:
+    """The fit as files, all of them in place of those of an earlier one, or none."""
     result = found.result
-    folder.mkdir(parents=True, exist_ok=True)
-    js.write_mesh(folder / "control.obj", result.control_mesh)
-    values = {"distance_mm": surface_distances(result), "deviation_mm": result.uncertainty().surface}
-    js.write_mesh(folder / "surface.ply", result.surface, vertex_data=values)
-    with replacing(folder / "report.json") as path:
-        path.write_text(result.report(uncertainty=True).as_json() + "\n", encoding="utf-8")
-    write_page(folder / "fit.html", result, title=name, start=found.start)
-    result.save(folder)
     written = ["control.obj", "surface.ply", "report.json", "fit.html", "fit.npz", "recipe.json"]
-    try:
-        with replacing(folder / "fit.png") as path:
-            draw_fit(result, found.start, title=name).savefig(path)
-        written.append("fit.png")
-    except ImportError as error:
-        print(f"note     no picture: {error}")
+    with filling(folder) as new:
+        js.write_mesh(new / "control.obj", result.control_mesh)
+        values = {"distance_mm": surface_distances(result), "deviation_mm": result.uncertainty().surface}
+        js.write_mesh(new / "surface.ply", result.surface, vertex_data=values)
+        (new / "report.json").write_text(result.report(uncertainty=True).as_json() + "\n", encoding="utf-8")
+        write_page(new / "fit.html", result, title=title, start=found.start)
+        assert result.recipe is not None
+        save_fit(new, result.fit, result.recipe, marks)
+        try:
+            draw_fit(result, found.start, title=title).savefig(new / "fit.png")
+            written.append("fit.png")
+        except ImportError as error:
+            print(f"note     no picture: {error}")
     print(f"wrote    {', '.join(written)} in {folder}")
 
 
@@ -303,25 +357,6 @@ class _Progress:
             self._bar.update(sweep.number - self._bar.n)  # a fit that goes on does not begin at 1
 
 
-def _scan_files(given: list[Path]) -> list[Path]:
-    """The files named, and those in the folders named, in order of their names."""
-    scans = []
-    for path in given:
-        if not path.is_dir():
-            scans.append(path)
-            continue
-        inside = sorted(file for file in path.iterdir() if file.suffix.lower() in _SCAN_FILES)
-        if not inside:
-            raise ValueError(f"the folder {path} holds no scan: {', '.join(sorted(_SCAN_FILES))}.")
-        scans += inside
-    return scans
-
-
-def _unique_name(scan: Path, scans: list[Path]) -> str:
-    """The file's name without its suffix, or with it where two files share the rest."""
-    return scan.stem if [other.stem for other in scans].count(scan.stem) == 1 else scan.name
-
-
 def _size(points: np.ndarray) -> str:
     return " x ".join(f"{extent:.0f}" for extent in np.ptp(points, axis=0)) + " mm"
 
@@ -329,12 +364,21 @@ def _size(points: np.ndarray) -> str:
 def _keep_what_serves_again() -> None:
     """Keep freed memory, and compiled programs from run to run, unless the environment says where already."""
     js.keep_freed_memory()
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxsubdiv"
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ and (cache := _make_cache()) is not None:
         jax.config.update("jax_compilation_cache_dir", str(cache))
     # A fit compiles many small programs besides few large ones: they are kept too.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def _make_cache() -> Path | None:
+    """The folder of compiled programs; None where the user has no home folder, or may not write there."""
+    try:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxsubdiv"
+        cache.mkdir(parents=True, exist_ok=True)
+    except (RuntimeError, OSError):
+        return None
+    return cache if os.access(cache, os.W_OK) else None
 
 
 def _parser() -> argparse.ArgumentParser:

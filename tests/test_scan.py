@@ -42,6 +42,7 @@ def test_refuses(case):
 def test_weights_or_ones():
     np.testing.assert_array_equal(Scan(POINTS).weights_or_ones(), np.ones(8))
     np.testing.assert_array_equal(Scan(POINTS, None, np.arange(8)).weights_or_ones(), np.arange(8))
+    np.testing.assert_allclose(Scan(POINTS, None, np.arange(8)).relative_weights(), np.arange(8) / 4)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -92,8 +92,6 @@ class Scene(NamedTuple):
     """The row of the slice of each point that may be shifted, -1 where it stays; None where none may."""
     open_vertices: Bool[Array | np.ndarray, "v"]
     """Which vertices of the surface lie on a boundary."""
-    part: Float[Array | np.ndarray, ""]
-    """Of the rows of the scan, that are points; less than 1 where the rest fills up an array."""
 
 
 def make_scene(scan: Scan, surface: js.RefinedSurface, planes: SlicePlanes | None = None) -> Scene:
@@ -104,10 +102,7 @@ def make_scene(scan: Scan, surface: js.RefinedSurface, planes: SlicePlanes | Non
         planes: of the slices that may be shifted.
     """
     of_points = None if planes is None else planes.rows_of(scan)
-    part = np.ones((), scan.points.dtype)
-    return Scene(
-        scan.without_slices(), surroundings(scan), find_strokes(scan), of_points, boundary_vertices(surface), part
-    )
+    return Scene(scan.without_slices(), surroundings(scan), find_strokes(scan), of_points, boundary_vertices(surface))
 
 
 def empty_look(scene: Scene) -> Look:
@@ -145,7 +140,7 @@ def measure(
     on, normals = js.evaluate(surface, at)
     away = points - on
     distance, spread = norm(away)[:, 0], scan.relative_deviations()
-    given = jnp.where(around.scattered, 0.0, scan.weights_or_ones())
+    given = jnp.where(around.scattered, 0.0, scan.relative_weights())
     corners, inside = corner_weights(surface, at)
     at_boundary = on_boundary(open_vertices, corners, inside)
     if scan.normals is not None:
@@ -184,10 +179,10 @@ def measure(
         pairs=Pairs(points, corners, inside, directions),
         distances=signed,
         weights=weights,
-        precisions=weights * scene.part / jnp.mean(scan.weights_or_ones()) / (scale * spread) ** 2 / alike,
+        precisions=weights / (scale * spread) ** 2 / alike,
         noise=noise,
         scale=scale,
-        rms=_mean_root(distance, scan.weights_or_ones()),
+        rms=_mean_root(distance, scan.relative_weights()),
         robust_rms=_mean_root(distance, weights),
     )
 

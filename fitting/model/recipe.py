@@ -13,6 +13,7 @@ import jaxsubdiv as js
 from ..start.align import Kind
 from ..start.control_mesh import FaceKind
 from ..start.parts import PartKind
+from .limits import check_numbers
 from .priors import Priors
 from .priors.shape_modes import ShapeModes
 from .robust import AbstractLoss, Barron, Huber, LeastSquares, Tukey, geman_mcclure
@@ -21,6 +22,8 @@ from .unknowns import Free
 _VERSION = 2  # 1 had no settings of `fit_scan`, which then are the defaults
 _SCHEMES = {kind.__name__: kind for kind in js.SCHEMES.values()}
 _LOSSES = {kind.__name__: kind for kind in (Barron, Huber, LeastSquares, Tukey)}
+_NUMBERS = ("levels", "max_sweeps", "tolerance", "landmark_deviation", "faces")
+_NUMBERS += ("tolerance_mm", "most_faces", "most_points")
 _M = TypeVar("_M", bound=eqx.Module)
 _S = TypeVar("_S", bound="Settings")
 
@@ -40,6 +43,9 @@ class Settings:
         faces, kind, closed, part, pose, mirror, tolerance_mm, most_faces, most_points: see `fit_scan`; `fit` has no use
             for them.
         mesh_normals, limit: see `js.build_topology`.
+
+    Raises:
+        ValueError: a number is out of its range; the text names it.
     """
 
     scheme: js.AbstractScheme
@@ -61,6 +67,9 @@ class Settings:
     most_points: int | None = None
     mesh_normals: bool = False
     limit: bool = False
+
+    def __post_init__(self):
+        check_numbers({name: getattr(self, name) for name in _NUMBERS})
 
     def topology(self, mesh: js.ControlMesh) -> js.Topology:
         """Tables of a control mesh, as `fit` needs them."""

@@ -9,6 +9,8 @@ from jaxtyping import Array, Float
 
 from jaxsubdiv import strong_float
 
+from .limits import check_numbers
+
 # Truncation of the scale estimate, in sigma, and the standard deviation that a Gaussian of sigma 1 has within it.
 _CUT, _STD_WITHIN_CUT = 2.5, 0.9546
 # A quarter of a Gaussian lies within this many sigma: a start that even a majority of outliers leaves finite.
@@ -36,6 +38,9 @@ class Huber(AbstractLoss):
 
     c: Float[Array, ""] = eqx.field(converter=strong_float, default=1.345)
 
+    def __check_init__(self):
+        check_numbers({"c": self.c})
+
     def weight(self, r: Float[Array, "*p"]) -> Float[Array, "*p"]:
         c = self.c.astype(r.dtype)
         return c / jnp.maximum(jnp.abs(r), c)
@@ -49,6 +54,9 @@ class Barron(AbstractLoss):
 
     alpha: Float[Array, ""] = eqx.field(converter=strong_float, default=-2.0)
     c: Float[Array, ""] = eqx.field(converter=strong_float, default=3.0)
+
+    def __check_init__(self):
+        check_numbers({"alpha": self.alpha, "c": self.c})
 
     def weight(self, r: Float[Array, "*p"]) -> Float[Array, "*p"]:
         alpha, squared = self.alpha.astype(r.dtype), (r / self.c.astype(r.dtype)) ** 2
@@ -73,6 +81,9 @@ class Tukey(AbstractLoss):
     """Tukey's biweight: nothing beyond `c` sigma counts at all."""
 
     c: Float[Array, ""] = eqx.field(converter=strong_float, default=4.685)
+
+    def __check_init__(self):
+        check_numbers({"c": self.c})
 
     def weight(self, r: Float[Array, "*p"]) -> Float[Array, "*p"]:
         return jnp.maximum(1 - (r / self.c.astype(r.dtype)) ** 2, 0.0) ** 2

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from numpy.typing import DTypeLike
 
 import jaxsubdiv as js
+from jaxsubdiv.console import printable
 from jaxsubdiv.files import replacing
 
 from .coverage import distances_to_scan
@@ -45,7 +46,7 @@ def write_page(
     """
     report = result.report(uncertainty=uncertainty)
     first = result.start if start is None else start
-    here, title = Path(__file__).parent, html.escape(title or "Fit")
+    here, title = Path(__file__).parent, html.escape(printable(title) or "Fit")
     parts = {
         "TITLE": title,
         "STATE_CLASS": "" if report.converged else ' class="bad"',

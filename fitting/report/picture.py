@@ -1,6 +1,7 @@
 """The picture of a fit: control mesh, surface with its error, convergence. matplotlib, so that no display is needed."""
 
 import io
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -8,6 +9,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 import jaxsubdiv as js
+from jaxsubdiv.console import printable
 
 from ..scan.closest_points import nearest_rows
 from .result import FitResult
@@ -41,13 +43,18 @@ def draw_fit(result: FitResult, start: js.ControlMesh, *, title: str = "") -> "F
     class Picture(Figure):
         """A figure that notebooks show where pyplot, which would tell them how, was never imported."""
 
+        def draw(self, renderer: Any) -> None:
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "Glyph .* missing from font")  # names are in all scripts
+                super().draw(renderer)
+
         def _repr_png_(self) -> bytes:
             file = io.BytesIO()
             self.savefig(file, format="png")
             return file.getvalue()
 
     figure = Picture(figsize=(15, 9.5), layout="constrained", dpi=100)
-    figure.suptitle(title, fontsize=14)
+    figure.suptitle(printable(title), fontsize=14, parse_math=False)  # a `$` in a name is no formula
     (before, after, smooth), (error, counts, convergence) = figure.subplots(2, 3)
     view, surface = js.view_of(result.surface), result.surface
     for ax, vertices, name in (

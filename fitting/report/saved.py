@@ -3,6 +3,7 @@
 import json
 import os
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +38,17 @@ _OF_SCAN = ("points", "normals", "weights", "deviations", "slices")
 _A_POINT = ("face", "uv", "directions", "distances", "weights", "precisions")
 
 
-def save_fit(folder: str | os.PathLike[str], fit: Fit, recipe: Settings) -> None:
-    """Write `fit.npz`, all that `load_fit` needs, and `recipe.json`, the settings in words; see `FitResult.save`."""
+def save_fit(
+    folder: str | os.PathLike[str], fit: Fit, recipe: Settings, marks: Mapping[str, str] | None = None
+) -> None:
+    """Write `fit.npz`, all that `load_fit` needs, and `recipe.json`, the settings in words; see `FitResult.save`.
+
+    Args:
+        folder: made where there is none.
+        fit: what was found.
+        recipe: the settings.
+        marks: of all that went into the fit, for `read_marks`.
+    """
     text, topology, look = recipe.to_json(), fit.topology, fit.look
     own = fit.settings.to_json()
     again = fit.settings.topology(js.ControlMesh(fit.model.template, topology.control_faces))
@@ -80,6 +90,7 @@ def save_fit(folder: str | os.PathLike[str], fit: Fit, recipe: Settings) -> None
         arrays[f"scan_{name}"] = getattr(fit.scan, name)
     inputs = fit.inputs
     arrays["alike"] = inputs.get("alike")
+    arrays["marks"] = None if marks is None else json.dumps(marks)
     if inputs.get("landmarks") is not None:
         arrays |= {f"anchor_{name}": value for name, value in inputs["landmarks"]._asdict().items()}
     if inputs.get("symmetry") is not None:
@@ -93,6 +104,20 @@ def save_fit(folder: str | os.PathLike[str], fit: Fit, recipe: Settings) -> None
         np.savez(path, **as_numpy)
     with replacing(folder / _RECIPE) as path:
         path.write_text(text + "\n", encoding="utf-8")
+
+
+def read_marks(folder: str | os.PathLike[str]) -> dict[str, str]:
+    """Marks of all that went into the saved fit of a folder, as `save_fit` was given them; none where it was not.
+
+    Raises:
+        ValueError: the file is damaged; the text names it.
+    """
+    path = Path(folder) / _FIT
+    try:
+        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
+            return json.loads(str(file["marks"])) if "marks" in file else {}
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def load_fit(folder: str | os.PathLike[str]) -> tuple[Fit, str]:

@@ -14,6 +14,7 @@ import numpy as np
 import jaxsubdiv as js
 from jaxsubdiv.files import replacing
 
+_FORMAT = 1  # of the files of a run; a new one where they, or what they are made from, come to mean something else
 _INPUT = "input "  # before the name of an input, in the file
 
 
@@ -27,7 +28,7 @@ class Checkpoint:
             inputs: all that the run depends on by name, as pytrees of arrays, numbers and words.
         """
         self.path = Path(path)
-        self._marks = {name: _mark(value) for name, value in inputs.items()} | {"release": js.__version__}
+        self._marks = marks_of(inputs)
 
     def read(self) -> dict[str, np.ndarray] | None:
         """The arrays last written; None where there is no file.
@@ -43,7 +44,7 @@ class Checkpoint:
         except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
             raise ValueError(f"{self.path} is no checkpoint: {error}. Delete it to start anew.") from None
         marks = {name.removeprefix(_INPUT): str(arrays.pop(name)) for name in list(arrays) if name.startswith(_INPUT)}
-        others = [name for name in sorted(marks.keys() | self._marks) if marks.get(name) != self._marks.get(name)]
+        others = differing(marks, self._marks)
         if others:
             raise ValueError(
                 f"{self.path} is of another fit, with another {', another '.join(others)}. Start with what it was "
@@ -74,6 +75,20 @@ class Checkpoint:
     def remove(self) -> None:
         """The run has ended, or is to be forgotten."""
         self.path.unlink(missing_ok=True)
+
+
+def marks_of(inputs: Mapping[str, Any]) -> dict[str, str]:
+    """What tells a run from those of other inputs, by the name of each input; the release counts as one.
+
+    Args:
+        inputs: all that the run depends on by name, as pytrees of arrays, numbers and words.
+    """
+    return {name: _mark(value) for name, value in inputs.items()} | {"release": f"{js.__version__} {_FORMAT}"}
+
+
+def differing(some: Mapping[str, str], others: Mapping[str, str]) -> list[str]:
+    """Names of the inputs that two runs do not share, by their marks."""
+    return [name for name in sorted(some.keys() | others) if some.get(name) != others.get(name)]
 
 
 def _as(array: np.ndarray, leaf: Any) -> Any:

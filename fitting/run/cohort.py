@@ -20,6 +20,7 @@ from jaxtyping import Array
 import jaxsubdiv as js
 from jaxsubdiv.errors import name_rows
 
+from ..model.limits import check_numbers
 from ..model.pairing import Scene, make_scene
 from ..model.priors import Priors
 from ..model.priors.boundary import BoundaryCurve
@@ -92,6 +93,8 @@ def fit_cohort(
         ScanError: a scan cannot be fitted; the text names it by its number. Or some have normals and others none.
         ValueError: as in `fit`; or the numbers of scans, controls, landmarks and boundaries differ.
     """
+    check_numbers({"max_sweeps": max_sweeps, "tolerance": tolerance, "landmark_deviation": landmark_deviation})
+    check_numbers({"at_once": at_once})
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
     n = len(scans)
     controls = _one_each(controls, js.Control, n, "controls")
@@ -286,8 +289,7 @@ def _fill_scene(scene: Scene, size: int, has_slices: bool) -> Scene:
     strokes = scene.strokes
     if strokes is not None:
         strokes = strokes._replace(nearest=fill(strokes.nearest), most=jnp.asarray(strokes.most, scan.points.dtype))
-    part = jnp.asarray(n / size, scan.points.dtype)
-    return Scene(whole, around, strokes, of_points, jnp.asarray(scene.open_vertices), part)
+    return Scene(whole, around, strokes, of_points, jnp.asarray(scene.open_vertices))
 
 
 def _split_common(subjects: list[Any]) -> tuple[Any, Any]:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 import jaxsubdiv as js
 from jaxsubdiv.linalg import unit
 
+from ..model.limits import check_numbers
 from ..model.pairing import Scene, make_scene
 from ..model.priors import Priors
 from ..model.priors.boundary import BoundaryCurve, checked_curve
@@ -80,6 +81,7 @@ def fit(
     throw: bool = True,
     on_sweep: Callable[[Sweep], None] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
+    keep_checkpoint: bool = False,
 ) -> FitResult:
     """Fit a control mesh, its normals and h to a scan, so that the refined surface passes through the points.
 
@@ -120,15 +122,17 @@ def fit(
         checkpoint: a folder that keeps the state after every sweep in `checkpoint.npz`. Called again with the same
             arguments, a fit that was stopped goes on from there, to the same result bit for bit. The file goes when
             the fit has ended.
+        keep_checkpoint: leave the file even then, for a caller that saves the result before it removes it.
 
     Raises:
         UserWarning: the start is so far off that the fit will hardly find its way; or faces of the control mesh lie
             upside down on their neighbours, which the fit turns back at its start, as far as it can.
         ScanError: the sizes of scan and control mesh differ as by a wrong unit, or there are too few points.
-        ValueError: the topology has no levels, or does not fit the control; the control mesh has no symmetry, though
-            the priors ask for it; the checkpoint is of another fit.
+        ValueError: a number is out of its range; the topology has no levels, or does not fit the control; the control
+            mesh has no symmetry, though the priors ask for it; the checkpoint is of another fit.
         RuntimeError: with `throw`, the fit did not converge or met values that are not finite.
     """
+    check_numbers({"max_sweeps": max_sweeps, "tolerance": tolerance, "landmark_deviation": landmark_deviation})
     check(scheme, topology, control, scan)
     # Made here and not in the signature: arrays made while a module loads would settle JAX's device and precision.
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
@@ -165,7 +169,7 @@ def fit(
             on_sweep(Sweep(k, float(state.robust_rms[k]), moved))
         if kept is not None and not done:
             kept.write_tree((y, state))
-    if kept is not None:
+    if kept is not None and not keep_checkpoint:
         kept.remove()
     found = FitResult(
         record_fit(model, y, state, scene, scan, control, inputs, Settings.of(scheme, topology, **settings), result)

@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 import jaxsubdiv as js
 
 from ..finding import Origin
+from ..model.limits import check_numbers
 from ..model.priors import Priors
 from ..model.priors.symmetry import Symmetry, find_symmetry
 from ..model.recipe import Settings
@@ -26,7 +27,7 @@ from ..start.align import Alignment, Kind, align, mirror_image, put
 from ..start.control_mesh import FaceKind, make_control_mesh
 from ..start.parts import PartKind
 from .checkpoint import Checkpoint
-from .fit import check, fit
+from .fit import CHECKPOINT, check, fit
 from .memory import memory_of_fit
 
 Outcome: TypeAlias = Literal["tolerance met", "noise reached", "no more faces"]
@@ -83,6 +84,7 @@ def fit_scan(
     most_points: int | None = Settings.most_points,
     on_stage: Callable[[str], None] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
+    keep_checkpoint: bool = False,
     **options: Any,
 ) -> ScanFit:
     """Fit a scan from end to end.
@@ -106,13 +108,18 @@ def fit_scan(
         on_stage: told what begins, in a few words.
         checkpoint: a folder from which a call with the same arguments goes on where it was stopped, see `fit`; where
             the fit started is in it too, in `checkpoint_start.npz`.
+        keep_checkpoint: leave both files when the fit has ended, see `fit`.
         options: of `fit`; or `mesh_normals` and `limit`, of `js.build_topology`. Where `priors` ask for symmetry, the
             partners are found on the template as it is given.
 
     Raises:
-        ValueError: the priors ask for likeness, and there is no template to be like.
+        ValueError: a number is out of its range; the priors ask for likeness, and there is no template to be like.
         ScanError, ValueError, ImportError, RuntimeError: as `align`, `control_mesh` and `fit` do.
     """
+    numbers = {"levels": levels, "faces": faces, "tolerance_mm": tolerance_mm, "most_faces": most_faces}
+    numbers |= {"most_points": most_points}
+    numbers |= {name: options[name] for name in ("max_sweeps", "tolerance", "landmark_deviation") if name in options}
+    check_numbers(numbers)
     priors = options.pop("priors", None) or Priors()
     if mesh is None and priors.likeness is not None and priors.likeness > 0:
         raise ValueError("`Priors.likeness` is to a template, and there is none: give one, or leave the likeness out.")
@@ -171,7 +178,12 @@ def fit_scan(
         partners = own_partners if start.splits == 0 else None
         if partners is None and mesh is not None and np.isfinite(priors.symmetry):
             partners = _partners(mesh, first, start.splits)
-        here = {"landmarks": of_first, "symmetry": partners, "checkpoint": checkpoint}
+        here = {
+            "landmarks": of_first,
+            "symmetry": partners,
+            "checkpoint": checkpoint,
+            "keep_checkpoint": keep_checkpoint,
+        }
         if start.unseen is not None:
             # Holes stay as they were filled; elsewhere the noise of the scan, which is in the fit now, is not expected.
             here |= {"alike": start.unseen, "priors": dataclasses.replace(priors, likeness=1.0)}
@@ -184,7 +196,9 @@ def fit_scan(
         if js.splits_in_four(result.scheme, topology):
             unseen = np.repeat(~_has_points(result), 4)
         start = _Start(finer, result.scheme, start.alignment, start.splits + 1, start.origin, unseen, start.shown)
-    if kept is not None:
+        if checkpoint is not None:
+            (Path(checkpoint) / CHECKPOINT).unlink(missing_ok=True)  # that of the fit before the split
+    if kept is not None and not keep_checkpoint:
         kept.remove()
     if scan is not whole:
         say(f"measures all {whole.n_points:,} points")

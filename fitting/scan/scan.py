@@ -45,7 +45,8 @@ class Scan(eqx.Module):
     Attributes:
         points: positions in mm.
         normals: outward normals of any length, or None.
-        weights: how much each point counts, not negative, or None where all count alike.
+        weights: how much each point counts, not negative, or None where all count alike. Only their ratio counts; a
+            point of weight 0 is as if it were not there.
         deviations: standard deviation of each point's distance, positive, or None where all are alike. Only their ratio
             counts: how large the noise is, the fit finds out.
         slices: the number of the slice that each point lies in, or None where the scan is not made of slices. `fit`
@@ -106,6 +107,13 @@ class Scan(eqx.Module):
     def weights_or_ones(self) -> Float[Array, "p"]:
         """The weights, 1 each where there are none."""
         return jnp.ones_like(self.points[:, 0]) if self.weights is None else self.weights
+
+    def relative_weights(self) -> Float[Array, "p"]:
+        """The weights over the mean of those that are not 0, 1 each where there are none."""
+        if self.weights is None:
+            return self.weights_or_ones()
+        weights = self.weights / jnp.max(self.weights)  # so that no sum leaves the range of single precision
+        return weights / jnp.mean(weights, where=weights > 0)
 
     def drawn(self, n: int) -> "Scan":
         """At most `n` of the points, drawn at random, always the same."""

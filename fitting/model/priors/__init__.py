@@ -1,13 +1,12 @@
 """What is known of a surface before it is measured: the settings, and the register of priors."""
 
-from collections.abc import Callable
-
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsubdiv import strong_float
 
+from ..limits import check_numbers
 from .base import AbstractFacePrior, AbstractPrior, AbstractVertexPrior, Place, Start
 from .bend import Bend
 from .boundary import BoundaryPrior
@@ -37,15 +36,8 @@ REGISTER: tuple[type[AbstractPrior], ...] = (
 __all__ = ["REGISTER", "AbstractFacePrior", "AbstractPrior", "AbstractVertexPrior", "Place", "Priors", "Start"]
 
 
-def _positive(value: object) -> Float[Array, ""]:
-    value = strong_float(value)
-    if not bool(value > 0):
-        raise ValueError(f"a standard deviation must be positive; got {value}. Give jnp.inf to leave a prior out.")
-    return value
-
-
-def _if_given(converter: Callable[[object], Float[Array, ""]]) -> Callable[[object], Float[Array, ""] | None]:
-    return lambda value: None if value is None else converter(value)
+def _if_given(value: object) -> Float[Array, ""] | None:
+    return None if value is None else strong_float(value)
 
 
 class Priors(eqx.Module):
@@ -79,14 +71,14 @@ class Priors(eqx.Module):
         ValueError: a standard deviation is not positive, or the likeness not from 0 to 1.
     """
 
-    bend: Float[Array, ""] | None = eqx.field(converter=_if_given(_positive), default=None)
-    stretch: Float[Array, ""] = eqx.field(converter=_positive, default=0.2)
-    h: Float[Array, ""] = eqx.field(converter=_positive, default=0.05)
-    symmetry: Float[Array, ""] = eqx.field(converter=_positive, default=np.inf)
-    shift: Float[Array, ""] = eqx.field(converter=_positive, default=3.0)
-    likeness: Float[Array, ""] | None = eqx.field(converter=_if_given(strong_float), default=None)
+    bend: Float[Array, ""] | None = eqx.field(converter=_if_given, default=None)
+    stretch: Float[Array, ""] = eqx.field(converter=strong_float, default=0.2)
+    h: Float[Array, ""] = eqx.field(converter=strong_float, default=0.05)
+    symmetry: Float[Array, ""] = eqx.field(converter=strong_float, default=np.inf)
+    shift: Float[Array, ""] = eqx.field(converter=strong_float, default=3.0)
+    likeness: Float[Array, ""] | None = eqx.field(converter=_if_given, default=None)
     shape: ShapeModes | None = eqx.field(converter=ShapeModes.of, default=None)
 
     def __check_init__(self):
-        if self.likeness is not None and not bool((self.likeness >= 0) & (self.likeness <= 1)):
-            raise ValueError(f"the likeness is a share, from 0 to 1; got {self.likeness}.")
+        check_numbers({name: getattr(self, name) for name in ("bend", "stretch", "symmetry", "shift", "likeness")})
+        check_numbers({"h of priors": self.h})

@@ -1,0 +1,105 @@
+"""The folder of a fit: of one run at a time, and with one fit in it, whole, or with a checkpoint as its mark."""
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from .fit import CHECKPOINT
+from .fit_scan import CHECKPOINT_START
+from .names import SUMMARY
+
+try:
+    import fcntl
+except ImportError:  # Windows: folders are not locked there
+    fcntl = None
+
+FIT = "fit.npz"
+"""What `fitting.load` reads; it is put in place after all other files."""
+RESULTS = ("control.obj", "surface.ply", "report.json", "fit.html", "recipe.json", "fit.png", FIT)
+_UNFINISHED = ".unfinished-"  # the folders of `jaxsubdiv.files.replacing` and of `fill`
+_OURS = {*RESULTS, CHECKPOINT, CHECKPOINT_START, SUMMARY}
+
+
+@contextmanager
+def working_in(folder: Path) -> Iterator[None]:
+    """Make a folder, see that it can be written, keep other runs out of it, and clean up what killed ones left.
+
+    Folders that were made and are empty at the end go again.
+
+    Raises:
+        OSError: the folder cannot be made or written.
+        ValueError: another run is working in it.
+    """
+    made = [one for one in (folder, *folder.parents) if not one.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with _locked(folder):
+            _clean(folder)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+            yield
+    finally:
+        with suppress(OSError):  # a folder that holds something stays, and so do those around it
+            for one in made:
+                one.rmdir()
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """The system lets go of the folder when the process ends, in whatever way."""
+    if fcntl is None:
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(
+                f"another run is working in {folder}. Wait for it, or give another folder with -o."
+            ) from None
+        except OSError:  # a disk that knows no locks
+            pass
+        yield
+    finally:
+        os.close(handle)
+
+
+def _clean(folder: Path) -> None:
+    """Remove what a killed run was writing; files of other names are somebody's own."""
+    for left in folder.glob(f"{_UNFINISHED}*/"):
+        with suppress(OSError):
+            for name in _OURS:
+                (left / name).unlink(missing_ok=True)
+            left.rmdir()
+    if not (folder / CHECKPOINT_START).exists():  # a run that ended was killed while it removed its checkpoint
+        (folder / CHECKPOINT).unlink(missing_ok=True)
+
+
+def is_unfinished(folder: Path) -> bool:
+    """Whether a run was stopped before its fit was whole in the folder."""
+    return (folder / CHECKPOINT_START).exists()
+
+
+@contextmanager
+def filling(folder: Path) -> Iterator[Path]:
+    """A folder to write the files of a fit to; they take their places together once the block is left without an error.
+
+    The checkpoint, which marks the folder as unfinished, goes last. What an earlier fit left and this one did not write
+    goes too.
+    """
+    new = Path(tempfile.mkdtemp(prefix=_UNFINISHED, dir=folder))
+    try:
+        yield new
+        for name in RESULTS:
+            if (new / name).exists():
+                os.replace(new / name, folder / name)
+            else:
+                (folder / name).unlink(missing_ok=True)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+    for name in (CHECKPOINT_START, CHECKPOINT):
+        (folder / name).unlink(missing_ok=True)

@@ -1,0 +1,86 @@
+"""Which files are scans, and the name of the folder that each gets."""
+
+import os
+import unicodedata
+from collections import Counter
+from collections.abc import Sequence
+from itertools import count
+from pathlib import Path
+
+SUMMARY = "summary.csv"
+_SCAN_FILES = {".ply", ".xyz", ".csv", ".txt", ".npz", ".vtp", ".vtk", ".stl", ".obj", ".off", ".gii"}
+_LONGEST = 200  # bytes: file systems take 255, and a file that is being written has a longer name
+
+
+def find_scans(given: Sequence[Path]) -> list[Path]:
+    """The files named, and those in the folders named in order of their names, each once.
+
+    Raises:
+        ValueError: a folder holds no scan.
+    """
+    scans = []
+    for path in given:
+        if not path.is_dir():
+            scans.append(path)
+            continue
+        inside = sorted(file for file in path.iterdir() if _is_scan(file))
+        if not inside:
+            raise ValueError(f"the folder {path} holds no scan: {', '.join(sorted(_SCAN_FILES))}.")
+        scans += inside
+    return list({os.path.abspath(scan): scan for scan in scans}.values())
+
+
+def _is_scan(file: Path) -> bool:
+    # The summary lies here where the results of an earlier run went into the folder of its scans.
+    return file.suffix.lower() in _SCAN_FILES and file.name.lower() != SUMMARY and not file.is_dir()
+
+
+def name_folders(scans: Sequence[Path]) -> list[str]:
+    """A folder's name for each of these files, no two alike on any file system.
+
+    A scan is named by its stem; where another has that too, by its whole name, and then by more and more of the folders
+    that it lies in; where all of that is alike, by a number too.
+    """
+    choices = [_choices(scan) for scan in scans]
+    steps = [0] * len(scans)
+    while True:
+        names = [options[step] for options, step in zip(choices, steps, strict=True)]
+        counts = Counter(map(_key, names))
+        more = [
+            i
+            for i, name in enumerate(names)
+            if steps[i] < len(choices[i]) - 1 and (counts[_key(name)] > 1 or _bad(name))
+        ]
+        if not more:
+            return _number(names)
+        for i in more:
+            steps[i] += 1
+
+
+def _choices(scan: Path) -> list[str]:
+    """Names for one scan, from the shortest on."""
+    parts = Path(os.path.abspath(scan)).parts[1:]
+    return [scan.stem] + ["_".join(parts[i:]) for i in reversed(range(len(parts)))]
+
+
+def _key(name: str) -> str:
+    """What names share that some file system takes for one: capitals, accents in two spellings, dots at the end."""
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold()).rstrip(". ")
+
+
+def _bad(name: str) -> bool:
+    """Whether a folder cannot have the name, as `..`, or not beside the summary."""
+    return _key(name) in ("", SUMMARY) or len(os.fsencode(name)) > _LONGEST
+
+
+def _number(names: list[str]) -> list[str]:
+    taken, found = {_key(name) for name in names}, []
+    seen: set[str] = set()
+    for name in names:
+        if _key(name) in seen or _bad(name):
+            short = os.fsdecode(os.fsencode(name)[:_LONGEST])
+            name = next(new for i in count(2) if _key(new := f"{short}-{i}") not in taken)
+            taken.add(_key(name))
+        seen.add(_key(name))
+        found.append(name)
+    return found

@@ -1,0 +1,368 @@
+"""Results of the command: each scan's own, whole or marked as unfinished, whatever names, streams or runs do."""
+
+import csv
+import io
+import os
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from scans import noise, problem
+
+import fitting
+import jaxsubdiv as js
+from fitting.__main__ import main
+from fitting.run.folder import RESULTS, filling, working_in
+from fitting.run.names import find_scans, name_folders
+from jaxsubdiv.console import lasting_streams, printable
+
+pytestmark = pytest.mark.usefixtures("command_settings")
+
+QUICK = ("--control", "control.obj", "--levels", "1", "--align", "none", "--max-sweeps", "1")
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch) -> Path:
+    """A control mesh and a scan, in the folder that the command runs in."""
+    p = problem()
+    js.write_mesh(tmp_path / "control.obj", js.ControlMesh(p.start.vertices, p.mesh.faces, p.start.normals))
+    monkeypatch.chdir(tmp_path)
+    write_scan("scan.xyz")
+    return tmp_path
+
+
+def write_scan(path: str, seed: int = 0, **how) -> None:
+    Path(path).parent.mkdir(exist_ok=True)
+    np.savetxt(path, problem().points + noise(seed), **({"fmt": "%.17g"} | how))
+
+
+def run(*arguments: object) -> int:
+    return main([str(argument) for argument in arguments])
+
+
+def names(folder: str | Path) -> list[str]:
+    return sorted(os.listdir(folder))
+
+
+def rows(path: str) -> list[dict[str, str]]:
+    return list(csv.DictReader(Path(path).read_text(encoding="utf-8").splitlines()))
+
+
+# Names
+
+
+@pytest.mark.parametrize(
+    ("scans", "folders"),
+    [
+        (["a.ply", "b.ply"], ["a", "b"]),
+        (["a.ply", "a.xyz", "b.ply"], ["a.ply", "a.xyz", "b"]),
+        (["p1/scan.xyz", "p2/scan.xyz"], ["p1_scan.xyz", "p2_scan.xyz"]),
+        (["x/p/scan.xyz", "y/p/scan.xyz"], ["x_p_scan.xyz", "y_p_scan.xyz"]),
+        (["a.ply", "q/a.ply.xyz", "p/a.xyz"], ["a.ply", "a.ply.xyz", "a.xyz"]),
+        (["...xyz", "a.xyz"], ["...xyz", "a"]),
+        (["summary.csv.xyz", "a.xyz"], ["summary.csv.xyz", "a"]),
+        (["A.xyz", "a.ply"], ["A.xyz", "a.ply"]),
+        (["e\u0301.xyz", "p/\u00e9.xyz"], ["e\u0301.xyz", "p_\u00e9.xyz"]),
+        (["a..xyz", "a.xyz"], ["a..xyz", "a.xyz"]),
+        (["/p_q/a.xyz", "/p/q_a.xyz", "/b/a.xyz", "/b/q_a.xyz"], ["p_q_a.xyz", "p_q_a.xyz-2", "b_a.xyz", "b_q_a.xyz"]),
+    ],
+)
+def test_no_two_scans_share_a_folder(monkeypatch, scans, folders):
+    monkeypatch.chdir("/")
+    assert name_folders([Path(scan) for scan in scans]) == folders
+
+
+def test_folder_names_are_short_enough_for_a_disk():
+    found = name_folders([Path("a" * 240 + ".xyz"), Path("a" * 240 + ".ply")])
+    assert len(set(found)) == 2 and max(map(len, found)) < 210
+
+
+def test_scans_of_a_folder_are_files_and_no_summary_and_each_counts_once(here):
+    write_scan("scans/a.xyz")
+    Path("scans/summary.csv").write_text("x,y,z\n1,2,3\n")
+    Path("scans/b.xyz").mkdir()
+    assert find_scans([Path("scans"), Path("scans/a.xyz"), Path("scan.xyz")]) == [Path("scans/a.xyz"), Path("scan.xyz")]
+
+
+def test_scans_of_one_name_get_their_own_results(here):
+    write_scan("p1/scan.xyz", 1)
+    write_scan("p2/scan.xyz", 2)
+    assert run("p1/scan.xyz", "p2/scan.xyz", *QUICK, "-o", "out") == 1
+    assert names("out") == ["p1_scan.xyz", "p2_scan.xyz", "summary.csv"]
+    for i in (1, 2):
+        np.testing.assert_array_equal(
+            fitting.load(f"out/p{i}_scan.xyz").scan.points, np.float64(problem().points + noise(i))
+        )
+    assert [row["scan"] for row in rows("out/summary.csv")] == ["p1/scan.xyz", "p2/scan.xyz"]
+
+
+ODD = ["$x_{$.xyz", "...xyz", "50% %s {0}.xyz", "caf\udce9.xyz", "\u4e2d\u6587 \u05d0.xyz", "<b>&.xyz", "-o.xyz"]
+
+
+def test_odd_names_work_everywhere_and_none_leaves_the_output(here):
+    for name in ODD:
+        write_scan(f"scans/{name}")
+    Path("sub").mkdir()
+    assert run("scans", *QUICK, "-o", "sub/out") == 1
+    assert names("sub") == ["out"]
+    folders = [name if name == "...xyz" else name.removesuffix(".xyz") for name in ODD]
+    assert names("sub/out") == sorted([*folders, "summary.csv"])
+    for folder in folders:
+        assert names(f"sub/out/{folder}") == sorted(RESULTS)
+    titles = [row["scan"] for row in rows("sub/out/summary.csv")]
+    assert sorted(titles) == sorted(map(printable, ODD)) and "caf\\xe9.xyz" in titles
+    assert "caf\\xe9.xyz" in Path("sub/out/caf\udce9/fit.html").read_text(encoding="utf-8")
+
+
+# Folders
+
+
+def test_fit_takes_the_place_of_another_as_a_whole(here, monkeypatch):
+    assert run("scan.xyz", *QUICK, "-o", "out") == 1
+    Path("out/notes.txt").write_text("my own")
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    assert run("scan.xyz", *QUICK, "--h", "1.1", "-o", "out") == 1
+    assert names("out") == sorted({*RESULTS, "notes.txt"} - {"fit.png"})  # the picture was of the other fit
+
+
+def test_fit_that_cannot_be_written_leaves_the_one_before_and_goes_on_from_its_last_sweep(here, monkeypatch, capsys):
+    assert run("scan.xyz", *QUICK, "-o", "out") == 1
+    before = {name: Path("out", name).read_bytes() for name in RESULTS}
+    command = ("scan.xyz", *QUICK[:-1], "3", "-o", "out")
+    with monkeypatch.context() as patch:
+        patch.setattr("fitting.__main__.save_fit", lambda *_: 1 / 0)
+        assert run(*command) == 2
+    assert names("out") == sorted([*RESULTS, "checkpoint.npz", "checkpoint_start.npz"])
+    assert before == {name: Path("out", name).read_bytes() for name in RESULTS}
+    sweeps = []
+    monkeypatch.setattr("fitting.__main__._Progress._update", lambda self, sweep: sweeps.append(sweep.number))
+    assert run(*command, "--resume") == 1
+    assert sweeps == [3] and names("out") == sorted(RESULTS)
+    assert len(fitting.load("out").rms) == 4
+    assert run("scan.xyz", *QUICK[:-1], "3", "-o", "undisturbed") == 1
+    for name in ("control.obj", "surface.ply", "report.json", "fit.html"):
+        assert Path("out", name).read_bytes() == Path("undisturbed", name).read_bytes()
+
+
+def test_files_are_put_in_place_together_with_the_mark_to_the_end(here):
+    Path("out").mkdir()
+    Path("out/checkpoint_start.npz").touch()
+    with pytest.raises(ZeroDivisionError), filling(Path("out")) as new:
+        (new / "control.obj").touch()
+        raise ZeroDivisionError
+    assert names("out") == ["checkpoint_start.npz"]
+    with filling(Path("out")) as new:
+        (new / "control.obj").touch()
+        assert "control.obj" not in names("out")
+    assert names("out") == ["control.obj"]
+
+
+def test_what_killed_runs_left_goes_and_what_is_somebody_elses_stays(here):
+    for left in (".unfinished-killed/fit.npz", ".unfinished-mine/letter.txt", ".unfinished-file", "checkpoint.npz"):
+        Path("out", left).parent.mkdir(parents=True, exist_ok=True)
+        Path("out", left).touch()
+    with working_in(Path("out")):
+        pass
+    assert names("out") == [".unfinished-file", ".unfinished-mine"]
+
+
+def test_two_runs_do_not_work_in_one_folder(here, capsys):
+    pytest.importorskip("fcntl")
+    with working_in(Path("out")):
+        assert run("scan.xyz", *QUICK, "-o", "out") == 2
+    assert "another run is working in out" in capsys.readouterr().err
+    assert run("scan.xyz", *QUICK, "-o", "out") == 1
+
+
+@pytest.mark.parametrize("scans", [["scan.xyz"], ["scan.xyz", "other.xyz"]])
+def test_folder_is_tried_before_the_work_starts(here, monkeypatch, capsys, scans):
+    write_scan("other.xyz")
+    monkeypatch.setattr("fitting.__main__.read_scan", lambda *_, **__: pytest.fail("began to work"))
+    assert run(*scans, *QUICK, "-o", "control.obj/out") == 2
+    assert "control.obj" in capsys.readouterr().err
+
+
+def test_failed_run_leaves_no_folders(here):
+    assert run("none.xyz", *QUICK, "-o", "deep/er/out") == 2
+    assert not Path("deep").exists()
+
+
+# What went in
+
+
+def with_weights(path: str) -> None:
+    np.savez(path, points=problem().points, weights=np.linspace(1, 2, 600))
+
+
+def test_resume_compares_all_that_went_in(here, capsys):
+    p = problem()
+    js.write_mesh("other.obj", js.ControlMesh(p.start.vertices * 1.01, p.mesh.faces, p.start.normals))
+    js.write_mesh("bare.obj", js.ControlMesh(p.start.vertices, p.mesh.faces))
+    np.savetxt("normals.xyz", np.hstack([p.points + noise(), p.points]), fmt="%.17g")
+    Path("on_scan.json").write_text('{"a": [1, 2, 3], "b": [4, 9, 6], "c": [7, 8, 1], "d": [0, 1, 9]}')
+    marks = ("--landmarks", "on_scan.json", "--control-landmarks", "on_scan.json")
+    command = ("scan.xyz", *QUICK, "-o", "out", "--resume")
+    assert run(*command) == 1
+    capsys.readouterr()
+    others = {
+        "another control mesh": ("scan.xyz", *command[1:], "--control", "other.obj"),
+        "another control mesh.": ("scan.xyz", *command[1:], "--control", "bare.obj"),
+        "another normals of the scan": ("normals.xyz", *command[1:]),
+        "another landmarks": (*command, *marks),
+        "another priors": (*command, "--symmetry", "1"),
+        "another points of the scan": (*command, "--scale", "1.01"),
+        "another scheme": (*command, "--h", "1.2"),
+    }
+    for words, other in others.items():
+        assert run(*other) == 2
+        assert f"out holds a fit with {words}" in capsys.readouterr().err
+    assert run(*command) == 1
+    assert "done     before, in out" in capsys.readouterr().out
+
+
+def test_saved_fit_that_does_not_say_what_it_is_of_is_not_taken_for_done(here, capsys):
+    problem().fit(max_sweeps=0).save("out")
+    assert run("scan.xyz", *QUICK, "-o", "out", "--resume") == 2
+    assert "out holds a fit that does not say of what. Without --resume" in capsys.readouterr().err
+
+
+# Failures
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError("oh"), SystemExit(3), MemoryError(), RecursionError("deep")])
+def test_scan_that_fails_in_whatever_way_does_not_end_a_batch(here, monkeypatch, capsys, error):
+    def read(path, **how):
+        if path.name == "bad.xyz":
+            raise error
+        return fitting.read_scan(path, **how)
+
+    write_scan("bad.xyz")
+    monkeypatch.setattr("fitting.__main__.read_scan", read)
+    assert run("bad.xyz", "scan.xyz", *QUICK, "-o", "out") == 2
+    assert names("out") == ["scan", "summary.csv"]
+    assert [row["status"] for row in rows("out/summary.csv")] == ["2", "1"]
+    assert f"error: {str(error) or type(error).__name__}" in capsys.readouterr().err
+
+
+def test_summary_that_cannot_be_written_does_not_end_a_batch(here, capsys):
+    write_scan("other.xyz")
+    Path("out/summary.csv").mkdir(parents=True)
+    assert run("other.xyz", "scan.xyz", *QUICK, "-o", "out") == 1
+    assert names("out") == ["other", "scan", "summary.csv"]
+    assert "summary.csv" in capsys.readouterr().err
+
+
+def test_works_without_a_home_folder(here, monkeypatch):
+    def unknown():
+        raise RuntimeError("Could not determine home directory.")
+
+    for name in ("HOME", "XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", unknown)
+    before = jax.config.jax_compilation_cache_dir
+    assert run("scan.xyz", *QUICK, "-o", "out") == 1
+    assert jax.config.jax_compilation_cache_dir == before
+    assert names("out") == sorted(RESULTS)
+
+
+class Broken(io.StringIO):
+    """A pipe whose reader has left."""
+
+    def write(self, text: str) -> int:
+        raise BrokenPipeError
+
+
+@pytest.mark.parametrize("stream", [None, Broken()])
+def test_closed_streams_lose_words_and_no_results(here, monkeypatch, stream):
+    with monkeypatch.context() as patch:
+        patch.setattr("sys.stdout", stream)
+        patch.setattr("sys.stderr", stream)
+        assert run("scan.xyz", "none.xyz", *QUICK, "-o", "out") == 2
+        assert sys.stdout is stream
+    assert names("out") == ["scan", "summary.csv"] and names("out/scan") == sorted(RESULTS)
+
+
+def test_letters_that_a_terminal_lacks_are_escaped(monkeypatch):
+    raw = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(raw, encoding="ascii"))
+    with lasting_streams():
+        print("caf\u00e9 \udce9")
+    assert raw.getvalue() == b"caf\\xe9 \\udce9\n"
+
+
+# Options
+
+SENSELESS = {
+    "--levels": ["0", "9"],
+    "--max-sweeps": ["-1"],
+    "--faces": ["3", "-80"],
+    "--points": ["0", "-1"],
+    "--tolerance": ["nan", "0", "-1", "inf"],
+    "--symmetry": ["nan", "0", "-1"],
+    "--likeness": ["nan", "-0.1", "1.1"],
+    "--h": ["nan", "inf", "-1"],
+    "--scale": ["nan", "0", "-1", "1e30"],
+    "--control-scale": ["nan", "0", "inf"],
+}
+
+
+@pytest.mark.parametrize("option", SENSELESS)
+def test_senseless_options_of_the_command_are_refused_by_name(here, capsys, option):
+    before = names(here)
+    for value in SENSELESS[option]:
+        assert run("scan.xyz", *QUICK, f"{option}={value}") == 2
+        words = capsys.readouterr().err
+        assert words.startswith(f"error: {option}: ") and "; got " in words
+    assert names(here) == before
+
+
+@pytest.mark.parametrize("value", [np.nan, 0.0, -1.0])
+@pytest.mark.parametrize("name", ["bend", "stretch", "h", "symmetry", "shift"])
+def test_senseless_deviations_are_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=f"`{name}`: a standard deviation must be positive, .*; got {value}"):
+        fitting.Priors(**{name: value})
+
+
+@pytest.mark.parametrize("make", [fitting.Huber, fitting.Tukey, fitting.cauchy, fitting.geman_mcclure])
+@pytest.mark.parametrize("value", [np.nan, 0.0, -1.0, np.inf])
+def test_senseless_losses_are_refused_by_name(make, value):
+    with pytest.raises(ValueError, match=f"`c`: the width of a loss .*; got {value}"):
+        make(value)
+
+
+def test_senseless_shapes_of_a_loss_are_refused_by_name():
+    for alpha in (np.nan, 3.0):
+        with pytest.raises(ValueError, match="`alpha`: the shape of a loss"):
+            fitting.Barron(alpha)
+    assert fitting.Barron(-np.inf).alpha == -np.inf
+
+
+OPTIONS = {"max_sweeps": -1, "tolerance": np.nan, "landmark_deviation": 0.0}
+MORE = {"levels": 0, "faces": 1, "tolerance_mm": -1.0, "most_faces": 0, "most_points": 0}
+
+
+@pytest.mark.parametrize("name", [*OPTIONS, *MORE])
+def test_senseless_options_of_the_functions_are_refused_by_name(name):
+    p, value = problem(), (OPTIONS | MORE)[name]
+    scan, mesh = fitting.Scan(p.points), js.ControlMesh(p.start.vertices, p.mesh.faces)
+    calls = [
+        lambda: fitting.fit_scan(scan, mesh, **{name: value}),
+        lambda: fitting.Recipe(js.Interpolating(), **{name: value}),
+    ]
+    if name in OPTIONS:
+        calls.append(lambda: fitting.fit(js.Interpolating(), p.topology, p.start, scan, **{name: value}))
+        calls.append(lambda: fitting.fit_cohort(js.Interpolating(), p.topology, p.start, [scan], **{name: value}))
+    for call in calls:
+        with pytest.raises(ValueError, match=f"`{name}`: .*; got {value}"):
+            call()
+
+
+@pytest.mark.parametrize("factor", [1e-30, 1e-6, 1e6, 1e30])
+def test_weights_of_one_size_count_as_none(factor):
+    p = problem()
+    plain = p.fit(p.points + noise(), max_sweeps=4)
+    found = p.fit(p.points + noise(), max_sweeps=4, weights=np.full(len(p.points), factor))
+    np.testing.assert_allclose(found.control.vertices, plain.control.vertices, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found.noise, plain.noise, rtol=1e-9)
