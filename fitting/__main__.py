@@ -20,7 +20,7 @@ import numpy as np
 
 import jaxsubdiv as js
 from jaxsubdiv import SCHEMES
-from jaxsubdiv.console import lasting_streams, plain_warnings, printable
+from jaxsubdiv.console import in_colour, lasting_streams, plain_warnings, printable
 from jaxsubdiv.files import replacing
 
 from .model.limits import check_numbers
@@ -38,6 +38,7 @@ from .run.recipe import Recipe, load, load_recipe
 from .scan.example import Example, example
 from .scan.landmarks import Landmarks, match_landmarks, read_landmarks
 from .scan.scan import Scan, read_scan
+from .start.parts import PartKind
 
 _EXAMPLE_NOISE = 3.0  # mm: the example starts from a control mesh that is wrong, to show that the fit mends it
 # What a scan, a file or a fit may be refused by, each with words of its own.
@@ -52,6 +53,7 @@ _SUMMARY = (
     "noise_mm",
     "misfit_mm",
     "inlier_share",
+    "warnings",
 )
 
 
@@ -66,7 +68,7 @@ class _Job(NamedTuple):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; exit status 0, 1 where a fit did not converge, 2 where an input cannot be used, 130 stopped."""
+    """The command line: exit status 0, 1 for a fit not to be trusted, 2 for an input of no use, 130 where stopped."""
     with lasting_streams(), plain_warnings():
         return _main(arguments)
 
@@ -113,11 +115,13 @@ def _recipe(options: argparse.Namespace) -> Recipe:
         if scheme.h is None:
             raise ValueError(f"the scheme {type(scheme).__name__} has no h: leave --h out.")
         scheme = eqx.tree_at(lambda s: s.h, scheme, jnp.asarray(options.h, scheme.h.dtype))
-    given = {name: getattr(options, name) for name in ("levels", "faces", "kind", "closed", "max_sweeps")}
+    given = {name: getattr(options, name) for name in ("levels", "faces", "kind", "closed", "part", "max_sweeps")}
     given |= {"tolerance_mm": options.tolerance, "most_points": options.points}
     given = {name: value for name, value in given.items() if value is not None}
     if options.align is not None:
         given["pose"] = None if options.align == "none" else options.align
+    if options.mirror:
+        given["mirror"] = True
     asked = {name: getattr(options, name) for name in ("symmetry", "likeness") if getattr(options, name) is not None}
     if asked:
         given["priors"] = dataclasses.replace(recipe.priors, **asked)
@@ -170,7 +174,7 @@ def _write_summary(path: Path, summary: str) -> None:
 
 
 def _run(scan: Path | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str) -> dict:
-    """One fit: its row of the summary, whose status is 0, 1 for one that did not converge, 2 for one that failed."""
+    """One fit: its row of the summary, whose status is 0, 1 for one not to be trusted, 2 for one that failed."""
     title, began = printable(title), time.perf_counter()
     try:
         with working_in(folder):
@@ -209,8 +213,10 @@ def _fit(scan: Path | None, folder: Path, options: argparse.Namespace, recipe: R
         )
     seconds = time.perf_counter() - began
     report, off = found.result.report(uncertainty=True), misfit(found.result)
-    print(f"done     in {seconds:.1f} s{_ending(found, off)}\n\n{report}\n")
+    print(f"done     in {seconds:.1f} s{_ending(found, off)}\n\n{dataclasses.replace(report, warnings=[])}\n")
     _save(folder, found, title, marks)
+    for finding in report.warnings:
+        print(in_colour(f"WARNING  {finding.text}"))
     return _row(title, found.result, off, seconds)
 
 
@@ -218,7 +224,7 @@ def _row(name: str, result: FitResult, off: float, seconds: float | None) -> dic
     report = result.report()
     return {
         "scan": name,
-        "status": 0 if report.converged else 1,
+        "status": 0 if report.trusted else 1,
         "seconds": "" if seconds is None else f"{seconds:.1f}",
         "points": report.n_points,
         "rms_mm": f"{report.rms:.4f}",
@@ -226,6 +232,7 @@ def _row(name: str, result: FitResult, off: float, seconds: float | None) -> dic
         "noise_mm": f"{report.noise:.4f}",
         "misfit_mm": f"{off:.4f}",
         "inlier_share": f"{report.inlier_share:.4f}",
+        "warnings": " ".join(finding.name for finding in report.warnings),
     }
 
 
@@ -391,8 +398,9 @@ def _parser() -> argparse.ArgumentParser:
         "distance of the scan and the standard deviation of the surface in mm at every vertex), report.json, fit.html "
         "(a page to turn the surface in, without a network), fit.png, and fit.npz and recipe.json for `fitting.load`; "
         "of several scans, a folder each and summary.csv. Lengths are in mm. A fit that was stopped, by Ctrl-C or "
-        "otherwise, goes on from the last sweep when the same command is given again. Exit status: 0 converged, 1 not "
-        "converged (files are written all the same), 2 an input cannot be used, 130 stopped by Ctrl-C.",
+        "otherwise, goes on from the last sweep when the same command is given again. Exit status: 0 the fit "
+        "converged and nothing speaks against it, 1 it is not to be trusted (the warnings say why; files are written "
+        "all the same), 2 an input cannot be used, 130 stopped by Ctrl-C.",
     )
     add = parser.add_argument
     add("scans", nargs="*", metavar="SCAN", help="points or meshes, or folders of them: .ply .xyz .csv .txt .npz .vtp")
@@ -401,6 +409,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--faces", type=int, help=f"of the control mesh, where it is made (default: {Recipe.faces})")
     add("--kind", choices=("triangle", "quad"), help=f"of these faces (default: {Recipe.kind})")
     add("--closed", action=argparse.BooleanOptionalAction, help="whether the anatomy is; default: found from the scan")
+    add("--part", choices=get_args(PartKind), help="of a scan that shows several; default: the largest, with a warning")
+    add("--mirror", action="store_true", help="fit the template's mirror image: that of the other side of the body")
     add("--align", choices=("similarity", "rigid", "affine", "none"), help=f"of the template (default: {Recipe.pose})")
     add("--landmarks", metavar="FILE", help="named places on the scan, .json or .csv; the template's in the next")
     add("--control-landmarks", metavar="FILE", help="the same names on the template")

@@ -74,6 +74,11 @@ class _Lasting:
         self._stream = self._nowhere
 
 
+def in_colour(text: str) -> str:
+    """Text in yellow where stdout is a terminal, unless the environment has `NO_COLOR`."""
+    return f"\x1b[33m{text}\x1b[0m" if sys.stdout.isatty() and not os.environ.get("NO_COLOR") else text
+
+
 def printable(text: str) -> str:
     """Text that can be written as UTF-8: bytes of a file's name that are no text become escapes such as `\\xe9`."""
     try:

@@ -18,9 +18,9 @@ from .record import Fit
 _NOISE_OVER_OWN, _NOISE_OVER_EDGE = 3.0, 0.12
 _UNEXPLAINED = 0.1
 _UNSUPPORTED = 0.5
-_TWO_WALLS = 0.25
+_TWO_WALLS = 0.15
 _AGAINST, _FACING = 0.05, -0.5
-_JUMP, _LAST = 1.5, 5
+_JUMP, _LAST = 1.2, 7
 _FOLDED = -0.2
 
 
@@ -168,19 +168,17 @@ def check_facing(seen: Evidence) -> Finding | None:
 
 
 def check_jumps(seen: Evidence) -> Finding | None:
-    """Whether the distances fell, and stayed down."""
-    rms = seen.fit.robust_rms[1:]
-    if len(rms) < 2:
-        return None
-    last = rms[-_LAST:]
-    ratio = float(last.max() / max(last.min(), np.finfo(float).tiny))
-    if ratio < _JUMP:
+    """Whether the distances fell to the end, or rose again and again."""
+    last = seen.fit.robust_rms[1:][-_LAST:]
+    rises = last[1:] / np.maximum(last[:-1], np.finfo(float).tiny)
+    rises = rises[rises > _JUMP]
+    if len(rises) < 2:
         return None
     return Finding(
         "distances_jump",
-        f"the RMS distance was {ratio:.1f} times as large in one of the last sweeps as in another: the surface has not "
-        "come to rest. Give a better start, or fewer faces.",
-        {"ratio": ratio},
+        f"the RMS distance rose in {len(rises)} of the last {len(last)} sweeps, by up to {rises.max() - 1:.0%}: the "
+        "surface goes to and fro. Give a better start, or fewer faces.",
+        {"rises": len(rises), "largest": float(rises.max())},
     )
 
 

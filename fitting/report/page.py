@@ -49,8 +49,9 @@ def write_page(
     here, title = Path(__file__).parent, html.escape(printable(title) or "Fit")
     parts = {
         "TITLE": title,
-        "STATE_CLASS": "" if report.converged else ' class="bad"',
+        "STATE_CLASS": "" if report.trusted else ' class="bad"',
         "STATE": html.escape(dict(report.as_rows())["fit"]),
+        "WARNINGS": "\n".join(f'<p class="bad">{html.escape(finding.text)}</p>' for finding in report.warnings),
         "CHOICES": _choices(uncertainty),
         "SHOWN_POINTS": f" (an even part of {_MOST_POINTS:,})" if report.n_points > _MOST_POINTS else "",
         "START": "" if first is None else '<label><input type="checkbox" id="start"> where the fit started</label>',

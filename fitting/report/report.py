@@ -109,11 +109,14 @@ class Report:
     def __str__(self) -> str:
         rows = self.as_rows()
         width = max(len(name) for name, _ in rows)
-        return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
+        table = [f"{name:<{width}}  {value}" for name, value in rows]
+        return "\n".join([*table, *(f"WARNING: {finding.text}" for finding in self.warnings)])
 
     def as_rows(self) -> list[tuple[str, str]]:
-        """The same as names and values in words: a table of two columns."""
+        """The same, less the warnings, as names and values in words: a table of two columns."""
         state = f"converged after {self.sweeps} sweeps" if self.converged else f"NOT CONVERGED: {self.reason}"
+        if self.converged and not self.trusted:
+            state += ", but NOT TO BE TRUSTED: see the warnings"
         h = [] if self.h is None else self.h if isinstance(self.h, list) else [self.h]
         rows = [("fit", state)]
         if self.pose is not None:
@@ -159,7 +162,6 @@ class Report:
             rows.append((f"worst place {i + 1}", f"{place.distance:+.3f} mm at ({at}), {place.n_points:,} points"))
         if self.rms_inliers > self.rms_start:
             rows.append(("note", "worse than the start: is the control mesh too coarse for the scan?"))
-        rows += [(f"WARNING {i + 1}", finding.text) for i, finding in enumerate(self.warnings)]
         return rows
 
     def as_dict(self) -> dict[str, object]:

@@ -41,6 +41,7 @@ _STEP, HOLD, _LET_GO, _FASTEST = 0.25, 8.0, 0.7, 1e6
 _TRIES = 6  # of a step that turns faces upside down: their vertices are held faster each time
 _LEAST_LEFT = 0.1  # of the degrees of freedom: what is less says that the scan has too few points
 _AT_REST = 0.01  # of a control edge: movements far below it are at rest, however exact the scan
+_MOST_AT_REST = 0.1  # of a control edge: movements far above it are none, however noisy the scan seems
 _MOST = 0.9  # of the surface: so much of it has to be at rest
 RUNNING, CONVERGED, NONFINITE, OUT_OF_SWEEPS = range(4)
 
@@ -178,7 +179,9 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
         counted = xp.maximum((seen.weights > 0).sum(), 1).astype(rms.dtype)
         edge = xp.asarray(model.edge)
         uncertainty = seen.scale * xp.sqrt(model.layout.n_vertices / counted)
-        at_rest = xp.asarray(self.rtol, rms.dtype) * xp.maximum(uncertainty, _AT_REST * edge)
+        # Of the surface alone: a scale that grows without bounds would let anything pass for rest.
+        bounded = xp.clip(uncertainty, _AT_REST * edge, _MOST_AT_REST * edge)
+        at_rest = xp.asarray(self.rtol, rms.dtype) * bounded
         at_noise = (k > 0) & (xp.asarray(floor) <= xp.maximum(seen.noise, LEAST_NOISE * edge))
         has_shifts = model.prior("shift") is not None
         annealed = state.strengths.annealed & at_noise & (state.shifting if has_shifts else True)
