@@ -55,6 +55,15 @@ def own_noise(points: Float[np.ndarray, "p 3"], counted: Bool[np.ndarray, "p"]) 
     return OwnNoise(sampled, float(np.median(off)) / _LEFT**0.5, float(np.median(spacing)))
 
 
+def among_their_own(points: Float[np.ndarray, "p 3"], chosen: Bool[np.ndarray, "p"]) -> Bool[np.ndarray, "p"]:
+    """Which of the chosen points have mostly others of them around: those of an object, not stray ones."""
+    own = chosen.copy()
+    if chosen.any():
+        _, near = nearest_rows(KDTree(points), points[chosen], min(_NEIGHBOURS, len(points)))
+        own[chosen] = chosen[near].mean(axis=1) > 0.5
+    return own
+
+
 def share_of_two_walls(
     feet: Float[np.ndarray, "p 3"], sides: Float[np.ndarray, "p 3"], distances: Float[np.ndarray, "p"]
 ) -> float:

@@ -11,12 +11,12 @@ import jaxsubdiv as js
 
 from ..finding import Finding
 from .coverage import at_pairs, unit
-from .evidence import OwnNoise, own_noise, share_of_two_walls
+from .evidence import OwnNoise, among_their_own, own_noise, share_of_two_walls
 from .record import Fit
 
 # Each limit lies between the fits that are wrong and those that are right of tests/bench/fit_trust.py.
 _NOISE_OVER_OWN, _NOISE_OVER_EDGE = 3.0, 0.12
-_UNEXPLAINED = 0.1
+_UNEXPLAINED = 0.03
 _UNSUPPORTED = 0.5
 _TWO_WALLS = 0.15
 _AGAINST, _FACING = 0.05, -0.5
@@ -103,7 +103,8 @@ def check_noise(seen: Evidence) -> Finding | None:
 def check_unexplained_points(seen: Evidence) -> Finding | None:
     """Whether points that lie on some surface lie on this one."""
     there = seen.own.sampled
-    off = there & ~seen.inliers
+    off = there.copy()
+    off[there] = among_their_own(np.asarray(seen.fit.look.pairs.points, np.float64)[there], ~seen.inliers[there])
     share = float(off.sum() / max(there.sum(), 1))
     if share < _UNEXPLAINED:
         return None

@@ -162,7 +162,7 @@ def two_walls_with_template(shared: Path) -> Situation:
 
 def coarse_face(shared: Path) -> Situation:
     given = _real("face")(shared)
-    return Situation(given.scan, None, {"levels": 2, "faces": 40}, wrong=True)
+    return Situation(given.scan, None, {"levels": 2, "faces": 40}, np.asarray(given.scan.points))
 
 
 def far_template(off: float) -> Callable[[Path], Situation]:
