@@ -321,7 +321,7 @@ def test_senseless_options_of_the_command_are_refused_by_name(here, capsys, opti
 @pytest.mark.parametrize("value", [np.nan, 0.0, -1.0])
 @pytest.mark.parametrize("name", ["bend", "stretch", "h", "symmetry", "shift"])
 def test_senseless_deviations_are_refused_by_name(name, value):
-    with pytest.raises(ValueError, match=f"`{name}`: a standard deviation must be positive, .*; got {value}"):
+    with pytest.raises(ValueError, match=f"`{name}`: a standard deviation must be positive; got {value}"):
         fitting.Priors(**{name: value})
 
 
