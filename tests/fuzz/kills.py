@@ -112,7 +112,7 @@ def run_episodes(kills: int, seed: int) -> None:
         if over:
             shutil.copytree("whole_a", out)
         more = () if over else ("--resume",)
-        while killed(start("b", str(out), *more), rng.uniform(0, 1.1 * seconds)):
+        while killed(start("b", str(out), *more), rng.uniform(0, 1.5 * seconds)):
             n += 1
             print(f"kill {n}: {check_after_kill(out, whole)}", flush=True)
         found = contents(out)
