@@ -1,5 +1,7 @@
 """Sizes that a fit can compute with."""
 
+from typing import Any
+
 import numpy as np
 
 import jaxsubdiv as js
@@ -17,10 +19,10 @@ def check_sizes(scan: Scan, mesh: js.ControlMesh | js.Control | None) -> None:
         ScanError: those of the scan are.
         ValueError: those of the control mesh are.
     """
-    of = {"scan": (scan.points, ScanError)}
+    given: list[tuple[str, Any, type[ValueError]]] = [("scan", scan.points, ScanError)]
     if mesh is not None:
-        of["control mesh"] = (mesh.vertices, ValueError)
-    for name, (rows, error) in of.items():
+        given.append(("control mesh", mesh.vertices, ValueError))
+    for name, rows, error in given:
         rows = np.asarray(rows, np.float64)
         size, most = float(np.ptp(rows, axis=0).max()), float(np.abs(rows).max())
         if 0 < size < _LEAST or most > _MOST:
