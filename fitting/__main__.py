@@ -397,10 +397,12 @@ def _parser() -> argparse.ArgumentParser:
         epilog="OUT gets control.obj (fitted control mesh with normals), surface.ply (refined surface, with the signed "
         "distance of the scan and the standard deviation of the surface in mm at every vertex), report.json, fit.html "
         "(a page to turn the surface in, without a network), fit.png, and fit.npz and recipe.json for `fitting.load`; "
-        "of several scans, a folder each and summary.csv. Lengths are in mm. A fit that was stopped, by Ctrl-C or "
-        "otherwise, goes on from the last sweep when the same command is given again. Exit status: 0 the fit "
-        "converged and nothing speaks against it, 1 it is not to be trusted (the warnings say why; files are written "
-        "all the same), 2 an input cannot be used, 130 stopped by Ctrl-C.",
+        "of several scans, a folder each, named by the scan, and where names are alike by its folders too, and "
+        "summary.csv. Files take their places together when a fit has ended; until then checkpoints mark OUT as "
+        "unfinished. Lengths are in mm. A fit that was stopped, by Ctrl-C or otherwise, goes on from the last sweep "
+        "when the same command is given again. Exit status: 0 the fit converged and nothing speaks against it, 1 it is "
+        "not to be trusted (the warnings say why; files are written all the same), 2 an input cannot be used, 130 "
+        "stopped by Ctrl-C.",
     )
     add = parser.add_argument
     add("scans", nargs="*", metavar="SCAN", help="points or meshes, or folders of them: .ply .xyz .csv .txt .npz .vtp")
@@ -434,7 +436,11 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--recipe", metavar="FILE", help="recipe.json of a fit: its settings; files, --scale and --labels are not in it"
     )
-    add("--resume", action="store_true", help="skip the scans that OUT has with the same points and settings")
+    add(
+        "--resume",
+        action="store_true",
+        help="skip the scans that OUT has whole fits of, from the same inputs and options",
+    )
     add("--example", choices=get_args(Example), default="head_fragment", help="which, without SCAN")
     return parser
 

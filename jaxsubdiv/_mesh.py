@@ -14,6 +14,7 @@ from ._fans import mesh_fans
 from ._normals import Weights, estimate_normals
 from .errors import MeshError, name_rows
 from .half_edges import Faces, HalfEdges, half_edges
+from .linalg import of_moderate_length
 
 # A face whose area is under this part of its longest edge squared has no direction that rounding would not change.
 _FLAT = 1e-12
@@ -55,7 +56,7 @@ class ControlMesh:
     ):
         self.vertices = _rows_of_three(vertices, "vertices")
         self.faces, self._names = _sort_faces(faces)
-        self.normals = None if normals is None else _rows_of_three(normals, "normals")
+        self.normals = None if normals is None else of_moderate_length(_rows_of_three(normals, "normals"))
         self.repairs = tuple(repairs)
         self._checked = False
         for array in (self.vertices, self.normals, *self.faces.values()):

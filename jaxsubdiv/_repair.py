@@ -24,6 +24,8 @@ _MERGE_WITHIN = 1e-8
 # A closed component whose volume is under this part of its area to the power 3/2 has no inside to speak of.
 _HOLLOW = 1e-9
 
+_MOST_PASSES = 8  # a mesh that was split is repaired until nothing changes: two or three passes
+
 
 def repair(mesh: ControlMesh, merge_within: float | None) -> ControlMesh:
     """What `ControlMesh.repaired` says.
@@ -32,17 +34,32 @@ def repair(mesh: ControlMesh, merge_within: float | None) -> ControlMesh:
     finite; copies made by splitting come last, as among the triangles do those that were quads with a repeated corner.
     """
     check_counts(mesh)
+    found, was_split = _repair_once(mesh, merge_within)
+    for _ in range(_MOST_PASSES):
+        if not was_split:
+            break
+        # Sheets that were turned after the split may fit one another now.
+        again, was_split = _repair_once(found, merge_within)
+        if not again.repairs:
+            break
+        notes = found.repairs + again.repairs
+        found = ControlMesh(again.vertices, again.faces, again.normals, repairs=notes)
+    return found
+
+
+def _repair_once(mesh: ControlMesh, merge_within: float | None) -> tuple[ControlMesh, bool]:
+    """The mesh after one pass, and whether sheets were split."""
     work = _Work(mesh)
     _merge_doubled(work, merge_within)
     _drop_not_finite(work)
     _drop_degenerate(work)
     _drop_repeated(work)
-    _split_crowded_edges(work)
+    was_split = _split_crowded_edges(work)
     reversed_faces = _orient(work)
     normals = None if mesh.normals is None else _mend_normals(work, _take_normals(work, mesh.normals), reversed_faces)
     # Vertices doubled on purpose, to part two solids that touch, were merged and split into the same rows again.
     notes = () if _unchanged(work, normals) else work.notes
-    return ControlMesh(work.vertices, work.faces, normals, repairs=notes)
+    return ControlMesh(work.vertices, work.faces, normals, repairs=notes), was_split
 
 
 class _Work:
@@ -205,8 +222,8 @@ def _drop_repeated(work: _Work) -> None:
 # ------------------------------------------------------------------------------------------------------------ splitting
 
 
-def _split_crowded_edges(work: _Work) -> None:
-    """Give sheets that meet in an edge of more than two faces their own vertices there.
+def _split_crowded_edges(work: _Work) -> bool:
+    """Give sheets that meet in an edge of more than two faces their own vertices there; returns whether any do.
 
     The faces at such an edge are paired into sheets. A fan is a set of corners at one vertex that are joined through
     edges, across paired faces only.
@@ -215,12 +232,13 @@ def _split_crowded_edges(work: _Work) -> None:
     counts = np.bincount(sides.edge)
     crowded = counts > 2
     if not crowded.any():
-        return
-    signs, _ = _signs(work, sides)
+        return False
     corners = _by_face(work.vertices, work.faces)
     at_edges = np.split(_sides_on(sides, crowded), np.cumsum(counts[crowded])[:-1])
-    sheets = [_pair_up(corners, sides, signs, at) for at in at_edges]
     after = _corners_after(work.faces)
+    given, sound = _given_edges(_in_a_row(work.sources), after)
+    signs = np.ones(len(work.origins), int) if sound else _signs(work, sides)[0]
+    sheets = [_pair_up(corners, sides, signs, given, at) for at in at_edges]
     fans = _fans(sides, after, sheets)
     _detach_sheets(fans, after, sides, sheets)
     at_crowded = crowded[sides.edge]
@@ -231,6 +249,7 @@ def _split_crowded_edges(work: _Work) -> None:
         f"Split the surface at {_count(crowded, 'edge')} with more than two faces: copied "
         f"{_count(n_copied, 'vertex', 'vertices')}{_opening(opened)}."
     )
+    return True
 
 
 def _copy_fans(work: _Work, fans: Int[np.ndarray, "s"], at_crowded: Bool[np.ndarray, "s"]) -> int:
@@ -274,16 +293,28 @@ def _pairs_of_sides(sides: HalfEdges) -> Int[np.ndarray, "n 2"]:
     return _sides_on(sides, np.bincount(sides.edge) == 2).reshape(-1, 2)
 
 
+def _given_edges(sources: Int[np.ndarray, "s"], after: Int[np.ndarray, "s"]) -> tuple[Int[np.ndarray, "s"], bool]:
+    """For every half-edge the label of its edge in the input, and whether the faces there were joined and agreed.
+
+    They do in a mesh that was split before: its sheets, which a merge brings together, are the same again.
+    """
+    ends = np.stack([sources, sources[after]], axis=1)
+    _, edge, counts = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
+    agree = len(np.unique(ends, axis=0)) == len(ends)
+    return edge.ravel(), agree and bool(counts.max() == 2)
+
+
 def _pair_up(
     corners_of: Callable[[int], Float[np.ndarray, "k 3"]],
     sides: HalfEdges,
     signs: Int[np.ndarray, "f"],
+    given: Int[np.ndarray, "s"],
     at: Int[np.ndarray, "n"],
 ) -> list[tuple[int, ...]]:
     """Sheets that pass through one edge, one or two half-edges each.
 
-    Faces belong together where they agree on their outside; the flatter their fold the better, and of equal folds the
-    convex one, so that solids that touch in an edge come apart.
+    Faces belong together where they agree on their outside: those first that shared an edge of the input; then the
+    flatter their fold the better, and of equal folds the convex one, so that solids that touch in an edge come apart.
     """
     corners = [corners_of(face) for face in sides.face[at]]
     signs = signs[sides.face[at]]
@@ -292,7 +323,10 @@ def _pair_up(
     forward = (sides.start[at] < sides.end[at]) == (signs > 0)
     fold = np.round(np.arccos(np.clip(normal @ normal.T, -1, 1)), 6)
     fitting = [(i, j) for i, j in combinations(range(len(at)), 2) if forward[i] != forward[j]]
-    fitting.sort(key=lambda ij: (fold[ij], normal[ij[0]] @ (middle[ij[1]] - middle[ij[0]]) > 0))
+    joined = given[at]
+    fitting.sort(
+        key=lambda ij: (joined[ij[0]] != joined[ij[1]], fold[ij], normal[ij[0]] @ (middle[ij[1]] - middle[ij[0]]) > 0)
+    )
     sheets, single = [], set(range(len(at)))
     for pair in fitting:
         if single.issuperset(pair):

@@ -12,9 +12,12 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Bool, Float, Int
+
+_SHORT = 1e-15
 
 PerRow: TypeAlias = Float[Array, "*rows 1"]
 
@@ -61,6 +64,13 @@ def together(vectors: Rows) -> Float[Array, "*rows 3"]:
 
 def _like(given: Rows, found: Vectors) -> Any:
     return found if isinstance(given, Vectors) else together(found)
+
+
+def of_moderate_length(normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
+    """Directions whose squares stay in the range of single precision: rows far from length 1 are scaled to it."""
+    size = np.abs(normals).max(axis=1, keepdims=True, initial=0)
+    far = np.isfinite(size) & (size > 0) & ((size < _SHORT) | (size > 1 / _SHORT))
+    return np.divide(normals, size, out=normals.copy(), where=far)
 
 
 def take(rows: Float[Array, "v _"], index: Int[Array, "*i"]) -> Float[Array, "*i _"]:

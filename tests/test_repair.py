@@ -444,3 +444,29 @@ def test_zero_normals_stay_zero():
 def test_what_no_repair_mends(vertices, faces, normals, words: str):
     with pytest.raises(MeshError, match=words):
         repaired(vertices, faces, normals)
+
+
+def random_mesh(seed: int) -> ControlMesh:
+    """Few vertices, many of them doubled, and faces of any corners among them."""
+    rng = np.random.default_rng(seed)
+    n = rng.integers(4, 12)
+    vertices = (rng.normal(size=(n, 3)), np.round(rng.normal(size=(n, 3))))[rng.integers(2)]
+    faces = {3: rng.integers(0, n, (rng.integers(1, 14), 3)), 4: rng.integers(0, n, (rng.integers(0, 7), 4))}
+    return ControlMesh(vertices, faces, rng.normal(size=(n, 3)) if rng.random() < 0.5 else None, check=False)
+
+
+def test_what_was_repaired_needs_no_repair():
+    changed = 0
+    for seed in range(200):
+        try:
+            made = random_mesh(seed).repaired()
+        except MeshError:  # nothing is left, or it has one side only
+            continue
+        made.check()
+        again = made.repaired()
+        changed += bool(made.repairs)
+        assert again.repairs == (), seed
+        np.testing.assert_array_equal(again.vertices, made.vertices)
+        for size in (3, 4):
+            np.testing.assert_array_equal(again.faces[size], made.faces[size])
+    assert changed > 100

@@ -321,7 +321,7 @@ def test_senseless_options_of_the_command_are_refused_by_name(here, capsys, opti
 @pytest.mark.parametrize("value", [np.nan, 0.0, -1.0])
 @pytest.mark.parametrize("name", ["bend", "stretch", "h", "symmetry", "shift"])
 def test_senseless_deviations_are_refused_by_name(name, value):
-    with pytest.raises(ValueError, match=f"`{name}`: a standard deviation must be positive, .*; got {value}"):
+    with pytest.raises(ValueError, match=f"`{name}`: a standard deviation must be positive; got {value}"):
         fitting.Priors(**{name: value})
 
 
@@ -366,3 +366,24 @@ def test_weights_of_one_size_count_as_none(factor):
     found = p.fit(p.points + noise(), max_sweeps=4, weights=np.full(len(p.points), factor))
     np.testing.assert_allclose(found.control.vertices, plain.control.vertices, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(found.noise, plain.noise, rtol=1e-9)
+
+
+@pytest.mark.parametrize("factor", [1e-20, 1e20])
+@pytest.mark.parametrize("control", [True, False])
+def test_coordinates_out_of_range_are_refused(factor, control):
+    p = problem()
+    mesh = js.ControlMesh(p.start.vertices * factor, p.mesh.faces) if control else None
+    with pytest.raises(fitting.ScanError, match=r"the scan measures .*: a fit takes sizes from 1e-06 to 1e\+08, in mm"):
+        fitting.fit_scan(fitting.Scan(p.points * factor), mesh)
+
+
+@pytest.mark.parametrize("length", [1e-200, 1e200])
+def test_only_directions_of_normals_count(length):
+    p, normals = problem(), problem().points
+    with jax.enable_x64(False):
+        scan, mesh = fitting.Scan(p.points, normals * length), js.ControlMesh(p.mesh.vertices, p.mesh.faces)
+        again = js.ControlMesh(mesh.vertices, mesh.faces, mesh.vertices * length).control()
+    for found, given in ((scan.normals, normals), (again.normals, mesh.vertices)):
+        found, given = (np.float64(rows) for rows in (found, given))
+        given = given / np.linalg.norm(given, axis=1, keepdims=True)
+        np.testing.assert_allclose(found / np.linalg.norm(found, axis=1, keepdims=True), given, atol=1e-6)

@@ -8,16 +8,22 @@ from jax.core import Tracer
 
 
 class _Limit(NamedTuple):
-    """What an option may be: `words` say it in a sentence."""
+    """What an option may be: `words` say it, and `advice` what to do."""
 
     words: str
     least: float
     most: float
     whole: bool = False
+    advice: str = ""
 
 
 # Squares of a deviation, and their reciprocals, are far from the ends of single precision; inf leaves a prior out.
-_DEVIATION = _Limit("a standard deviation must be positive, from 1e-9 on; inf leaves a prior out", 1e-9, np.inf)
+_DEVIATION = _Limit(
+    "a standard deviation must be positive",
+    1e-9,
+    np.inf,
+    advice=" Give jnp.inf to leave a prior out, else 1e-9 or more.",
+)
 _KNOWN_DEVIATION = _Limit("a standard deviation must be positive, from 1e-9 to 1e9", 1e-9, 1e9)
 _LENGTH = _Limit("it is a length in mm, from 1e-9 to 1e9", 1e-9, 1e9)
 _FACES = _Limit("it is a whole number of faces, from 4 to 10 million", 4, 1e7, whole=True)
@@ -63,4 +69,4 @@ def check_numbers(numbers: Mapping[str, Any], names: Mapping[str, str] | None = 
         kinds = "iu" if limit.whole else "iuf"
         if given.dtype.kind not in kinds or given.ndim or not limit.least <= given <= limit.most:
             own = f"`{name.split()[0]}`" if names is None else names[name]
-            raise ValueError(f"{own}: {limit.words}; got {value}.")
+            raise ValueError(f"{own}: {limit.words}; got {value}.{limit.advice}")

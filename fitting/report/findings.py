@@ -16,7 +16,7 @@ from .record import Fit
 
 # Each limit lies between the fits that are wrong and those that are right of tests/bench/fit_trust.py.
 _NOISE_OVER_OWN, _NOISE_OVER_EDGE = 3.0, 0.12
-_UNEXPLAINED = 0.03
+_UNEXPLAINED_FAR, _FAR, _UNEXPLAINED = 0.03, 0.1, 0.08  # far: in control edges
 _UNSUPPORTED = 0.5
 _TWO_WALLS = 0.15
 _AGAINST, _FACING = 0.05, -0.5
@@ -106,9 +106,11 @@ def check_unexplained_points(seen: Evidence) -> Finding | None:
     off = there.copy()
     off[there] = among_their_own(np.asarray(seen.fit.look.pairs.points, np.float64)[there], ~seen.inliers[there])
     share = float(off.sum() / max(there.sum(), 1))
-    if share < _UNEXPLAINED:
+    if share < _UNEXPLAINED_FAR:
         return None
     far, at = float(np.median(np.abs(seen.distances[off]))), seen.feet[off].mean(axis=0)
+    if share < _UNEXPLAINED and far < _FAR * seen.edge:
+        return None  # detail that the control mesh is too coarse for
     return Finding(
         "points_unexplained",
         f"{share:.0%} of the points that are not scattered lie off the surface by more than 3 x the noise, half of "

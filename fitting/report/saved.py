@@ -99,11 +99,11 @@ def save_fit(
         arrays |= {f"boundary_{name}": value for name, value in inputs["boundary"]._asdict().items()}
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    with replacing(folder / _FIT) as path:
-        as_numpy: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items() if value is not None}
-        np.savez(path, **as_numpy)
     with replacing(folder / _RECIPE) as path:
         path.write_text(text + "\n", encoding="utf-8")
+    with replacing(folder / _FIT) as path:  # last: where it is, all is
+        as_numpy: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items() if value is not None}
+        np.savez(path, **as_numpy)
 
 
 def read_marks(folder: str | os.PathLike[str]) -> dict[str, str]:

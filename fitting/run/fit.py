@@ -37,6 +37,7 @@ from ..solve.strengths import FromScan, first_strengths
 from ..solve.sweeps import State, Subject, Sweeps, hold_priors, subject_residual
 from ..start.folds import Folds, unfolded_start
 from .checkpoint import Checkpoint
+from .sizes import check_sizes
 
 LinearSolver: TypeAlias = Literal["sparse", "conjugate gradients"]
 
@@ -324,6 +325,7 @@ def check(scheme: js.AbstractScheme, topology: js.Topology, control: js.Control,
         )
     if not all(np.isfinite(values).all() for values in jax.tree.leaves((control.vertices, scheme))):
         raise ValueError("the control vertices or h are not finite: there is no surface to start from.")
+    check_sizes(scan, control)
     n_needed = control.vertices.shape[0]
     if scan.n_points < n_needed:
         raise ScanError(

@@ -29,6 +29,7 @@ from ..start.parts import PartKind
 from .checkpoint import Checkpoint
 from .fit import CHECKPOINT, check, fit
 from .memory import memory_of_fit
+from .sizes import check_sizes
 
 Outcome: TypeAlias = Literal["tolerance met", "noise reached", "no more faces"]
 
@@ -120,6 +121,7 @@ def fit_scan(
     numbers |= {"most_points": most_points}
     numbers |= {name: options[name] for name in ("max_sweeps", "tolerance", "landmark_deviation") if name in options}
     check_numbers(numbers)
+    check_sizes(scan, mesh)
     priors = options.pop("priors", None) or Priors()
     if mesh is None and priors.likeness is not None and priors.likeness > 0:
         raise ValueError("`Priors.likeness` is to a template, and there is none: give one, or leave the likeness out.")

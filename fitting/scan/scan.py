@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 import jaxsubdiv as js
 from jaxsubdiv import read_texts, strong_float
 from jaxsubdiv.errors import name_rows
+from jaxsubdiv.linalg import of_moderate_length
 
 _LABELS, _SLICE = ("label", "contour"), "slice"
 
@@ -21,6 +22,13 @@ class ScanError(ValueError):
 
 def _optional(value: object) -> Array | None:
     return None if value is None else strong_float(value)
+
+
+def _optional_directions(value: object) -> Array | None:
+    if value is None or isinstance(value, Array):
+        return _optional(value)
+    rows = np.asarray(value, float)
+    return strong_float(of_moderate_length(rows) if rows.shape[1:] == (3,) else rows)  # the shape is checked later
 
 
 def _optional_whole(value: object) -> Array | None:
@@ -60,7 +68,7 @@ class Scan(eqx.Module):
     """
 
     points: Float[Array, "p 3"] = eqx.field(converter=strong_float)
-    normals: Float[Array, "p 3"] | None = eqx.field(converter=_optional, default=None)
+    normals: Float[Array, "p 3"] | None = eqx.field(converter=_optional_directions, default=None)
     weights: Float[Array, "p"] | None = eqx.field(converter=_optional, default=None)
     deviations: Float[Array, "p"] | None = eqx.field(converter=_optional, default=None)
     slices: Int[Array, "p"] | None = eqx.field(converter=_optional_whole, default=None)

@@ -25,13 +25,13 @@ import meshes
 import jaxsubdiv as js
 from fitting.__main__ import main  # loaded once: the runs are forks, which begin at once
 
-SCANS = ("p1/scan.xyz", "p2/scan.xyz", "...xyz")
+SCANS = ("p1/scan.xyz", "p2/scan.xyz")
 COMMAND = [*SCANS, "--control", "control.obj", "--levels", "1", "--max-sweeps", "3"]
 OPTIONS = {"a": [], "b": ["--h", "1.1"]}
 
 
 def write_inputs(rng: np.random.Generator) -> None:
-    """Three noisy ellipsoids, and a rough one as the template."""
+    """Two noisy ellipsoids, and a rough one as the template."""
     vertices, faces = meshes.mixed_closed()
     js.write_mesh("control.obj", js.ControlMesh(vertices * (24, 18, 15), sorted(faces, key=len)))
     for i, name in enumerate(SCANS):
@@ -112,7 +112,7 @@ def run_episodes(kills: int, seed: int) -> None:
         if over:
             shutil.copytree("whole_a", out)
         more = () if over else ("--resume",)
-        while killed(start("b", str(out), *more), rng.uniform(0, 1.1 * seconds)):
+        while killed(start("b", str(out), *more), rng.uniform(0, 1.5 * seconds)):
             n += 1
             print(f"kill {n}: {check_after_kill(out, whole)}", flush=True)
         found = contents(out)
