@@ -28,12 +28,6 @@ class Rows(NamedTuple):
         return self.values[self.starts[:, None] + np.arange(n_columns)]
 
 
-def decode(data: bytes) -> str:
-    """UTF-8 with any line ends; other bytes become replacement characters, since only comments and names have any."""
-    text = data.decode("utf-8", errors="replace").removeprefix("\ufeff")
-    return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
-
-
 def parse_rows(path: Path, text: str, lines: Int[np.ndarray, "l"] | int = 1) -> Rows:
     """Numbers between white space, one row a line; blank lines give no row.
 
