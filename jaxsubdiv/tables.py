@@ -133,7 +133,7 @@ def _records(path: Path, text: str, delimiter: str) -> Iterator[tuple[int, list[
         nonlocal inside
         for line in text.split("\n"):
             goes_on, inside = inside, True  # until the record ends, and the loop below says so
-            yield line + "\n" if goes_on else _without_comment(line, delimiter)
+            yield (line if goes_on else _without_comment(line, delimiter)) + "\n"
 
     parser = csv.reader(lines(), delimiter=delimiter, skipinitialspace=True, strict=True)
     while True:

@@ -58,7 +58,7 @@ def read_landmarks(path: str | Path, *, scale: float = 1.0) -> dict[str, Float[n
     landmarks: dict[str, Float[np.ndarray, "3"]] = {}
     try:
         for name, where, values in readers[path.suffix.lower()](path):
-            position = np.array(values) * scale if _are_three_numbers(values) else np.full(3, np.nan)
+            position = np.array(values, np.float64) * scale if _are_three_numbers(values) else np.full(3, np.nan)
             if not np.isfinite(position).all():
                 raise ScanError(f"{path}, {where}: a landmark is three finite numbers x, y, z; got {str(values)[:80]}.")
             if name in landmarks:

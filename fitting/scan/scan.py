@@ -136,7 +136,7 @@ def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[st
     slices = None if _SLICE not in columns else _numbers(path, columns[_SLICE])
     words = [labels] if isinstance(labels, str) else list(labels)
     if not words:
-        return Scan(*cloud, slices=slices)
+        return _scan(path, *cloud, None, slices)
     of_rows = next((columns[name] for name in _LABELS if name in columns), [])
     chosen = np.array([any(word.casefold() in one.casefold() for word in words) for one in of_rows], bool)
     if not chosen.any():
@@ -144,7 +144,15 @@ def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[st
         wanted = " or ".join(f"'{word}'" for word in words)
         raise ScanError(f"{path.name}: no row has a label that holds {wanted}. It has: {there}.")
     kept = (None if rows is None else rows[chosen] for rows in (*cloud, None, slices))
-    return Scan(*kept)
+    return _scan(path, *kept)
+
+
+def _scan(path: Path, *parts: np.ndarray | None) -> Scan:
+    try:
+        with np.errstate(over="ignore"):  # what passes single precision is not finite, and told as such
+            return Scan(*parts)
+    except ScanError as error:
+        raise ScanError(f"{path.name}: {error}") from None
 
 
 def _numbers(path: Path, texts: list[str]) -> Int[np.ndarray, "p"]:

@@ -119,7 +119,8 @@ def read_mesh(path: str | os.PathLike[str], *, scale: float | int = 1.0, check: 
     normals = contents.normals
     normals = None if normals is None else _numbers(path.name, "normals", normals, (len(vertices), 3))
     try:
-        return ControlMesh(_scaled(vertices, scale), contents.faces, normals, check=check)
+        with np.errstate(over="ignore", invalid="ignore"):  # areas of faces as large as numbers can be
+            return ControlMesh(_scaled(vertices, scale), contents.faces, normals, check=check)
     except MeshError as error:
         mend = " Read it with check=False to get there." if "repaired()" in str(error) else ""
         raise MeshError(f"{path.name}: {error}{mend}") from None

@@ -12,6 +12,7 @@ from jaxtyping import Int, Shaped
 
 from ..errors import MeshError, name_rows
 from ._contents import Contents, VertexData, by_size, check_polygons, doubles, library
+from ._text import parse_numbers
 
 _NORMALS = "Normals"
 _TYPES = {
@@ -82,13 +83,11 @@ class _Cursor:
                 self.refuse(f"{n} numbers are announced, but the file ends after {len(words)}")
             words += [match[0] for match in taken]
             self.at += taken[-1].end()
-        try:
-            return np.array([float(word) for word in words], np.float64)
-        except ValueError:
-            bad = next(
-                word for word in words if not re.fullmatch(rb"[+-]?([0-9.]+(e[+-]?[0-9]+)?|inf|nan)", word.lower())
-            )
+        values = parse_numbers(b" ".join(words).decode("ascii", errors="replace"))
+        if len(values) < n:
+            bad = next(word for word in words if len(parse_numbers(word.decode("ascii", errors="replace"))) != 1)
             self.refuse(f"'{bad[:40].decode(errors='replace')}' is not a number")
+        return values
 
     def skip(self, n_bytes: int) -> None:
         """Leave bytes out."""
