@@ -18,9 +18,9 @@ from ._edge_length import edge_length as edge_length
 from ._evaluate import SurfaceJet as SurfaceJet
 from ._evaluate import evaluate_control as evaluate_control
 from ._io import PointCloud as PointCloud
+from ._io import read_labelled_points as read_labelled_points
 from ._io import read_mesh as read_mesh
 from ._io import read_points as read_points
-from ._io import read_texts as read_texts
 from ._io import write_mesh as write_mesh
 from ._memory import keep_freed_memory as keep_freed_memory
 from ._mesh import ControlMesh as ControlMesh

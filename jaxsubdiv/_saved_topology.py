@@ -3,8 +3,9 @@
 import dataclasses
 import json
 import os
-import zipfile
-from typing import Any
+from pathlib import Path
+from types import UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import equinox as eqx
 import jax
@@ -14,6 +15,7 @@ from ._fans import Fan, Fans
 from ._masks import MaskGroup, Masks
 from ._scheme.bezier_triangle import PatchLevel, Places
 from ._topology import Level, LimitMasks, MaskLevel, Topology
+from .archives import read_arrays
 from .files import replacing
 
 _VERSION = 1
@@ -44,15 +46,14 @@ def load_topology(path: str | os.PathLike[str]) -> Topology:
         ValueError: the file is damaged, of a later version, or no topology; the text names it and says what is wrong.
     """
     try:
-        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
-            arrays = dict(file)
+        arrays = read_arrays(Path(path), text=True)
         about = json.loads(str(arrays["about"]))
         if about["version"] != _VERSION:
             raise ValueError(
                 f"a topology of version {about['version']!r}, but this release reads {_VERSION}. Update it."
             )
         topology = _built(about["tables"], arrays)
-    except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{os.fspath(path)}: no saved topology, or a damaged one: {error}") from None
     if not isinstance(topology, Topology):
         raise ValueError(f"{os.fspath(path)}: no saved topology.")
@@ -77,17 +78,36 @@ def _plain(value: Any, arrays: dict[str, Any]) -> Any:
     return value
 
 
-def _built(value: Any, arrays: dict[str, np.ndarray]) -> Any:
+def _built(value: Any, arrays: dict[str, np.ndarray | None]) -> Any:
     if isinstance(value, list):
         return tuple(_built(part, arrays) for part in value)
     if not isinstance(value, dict):
         return value
     if "array" in value:
-        return jax.numpy.asarray(arrays[value["array"]])
+        return jax.numpy.asarray(arrays[value["array"]])  # an array of text is refused here
     if "kind" not in value:
         return {int(size): _built(part, arrays) for size, part in value["faces"].items()}
     kind = _KINDS[value["kind"]]
     module = object.__new__(kind)  # past the converters, which take the arrays of numpy that tables are built from
+    hints = get_type_hints(kind)
     for field in dataclasses.fields(kind):
-        object.__setattr__(module, field.name, _built(value[field.name], arrays))
+        part = _built(value[field.name], arrays)
+        if not _fits(part, hints[field.name]):
+            raise ValueError(f"`{field.name}` of {value['kind']} is not as it should be.")
+        object.__setattr__(module, field.name, part)
     return module
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value is of an annotated type, inside tuples and dicts too."""
+    parts = get_args(hint)
+    if isinstance(hint, UnionType) or get_origin(hint) is Union:
+        return any(_fits(value, part) for part in parts)
+    if get_origin(hint) is tuple:
+        if not isinstance(value, tuple):
+            return False
+        each = [parts[0]] * len(value) if parts[-1] is Ellipsis else list(parts)
+        return len(each) == len(value) and all(map(_fits, value, each))
+    if get_origin(hint) is dict:
+        return isinstance(value, dict) and all(_fits(part, parts[1]) for part in value.values())
+    return isinstance(value, hint)

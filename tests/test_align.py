@@ -286,10 +286,10 @@ BAD_FILES = {
     "a.json": ('{"lpa": [1, 2]}', r"a\.json, 'lpa': a landmark is three finite numbers x, y, z; got \[1, 2\]"),
     "b.json": ("{", r"b\.json is no JSON"),
     "c.json": ("[1]", r"c\.json: landmarks in JSON are an object of names"),
-    "d.csv": ("lpa,1,2,3\nrpa,1,x,3\n", r"d\.csv, line 2: a landmark is three finite numbers"),
+    "d.csv": ("lpa,1,2,3\nrpa,1,x,3\n", r"d\.csv, line 2: 'x' is not a number"),
     "e.csv": ("lpa,1,2,3\nlpa,1,2,3\n", r"e\.csv, line 2: a landmark of the name 'lpa' came before"),
     "f.csv": ("name,x,y,z\n", r"f\.csv holds no landmarks"),
-    "g.txt": ("lpa 1 2 3", r"landmarks are read from \.json and \.csv files, not from \.txt"),
+    "g.txt": ("lpa 1 2 3", r"landmarks are read from \.json, \.csv and \.fcsv files, not from \.txt"),
 }
 
 

@@ -61,11 +61,12 @@ def rows_of_text(separator: str, *columns: np.ndarray) -> str:
     return "\n".join(separator.join(map(repr, row)) for row in np.column_stack(columns).tolist())
 
 
+NORMALS = POINTS / np.linalg.norm(POINTS, axis=1, keepdims=True)
 WEIGHTS = np.arange(8.0)
 FILES = {
-    "a.xyz": rows_of_text(" ", POINTS, POINTS + 1),
-    "a.csv": "x,y,z,nx,ny,nz,weight\n" + rows_of_text(",", POINTS, POINTS + 1, WEIGHTS),
-    "a.npz": {"points": POINTS, "normals": POINTS + 1, "weights": WEIGHTS},
+    "a.xyz": rows_of_text(" ", POINTS, NORMALS),
+    "a.csv": "x,y,z,nx,ny,nz,weight\n" + rows_of_text(",", POINTS, NORMALS, WEIGHTS),
+    "a.npz": {"points": POINTS, "normals": NORMALS, "weights": WEIGHTS},
 }
 
 
@@ -76,7 +77,7 @@ def test_reads_points_normals_and_weights_of_a_file(tmp_path, name, scale):
     np.savez(tmp_path / name, **content) if isinstance(content, dict) else (tmp_path / name).write_text(content)
     scan = read_scan(tmp_path / name, scale=scale)
     np.testing.assert_array_equal(scan.points, POINTS * scale)
-    np.testing.assert_array_equal(scan.normals, POINTS + 1)
+    np.testing.assert_array_equal(scan.normals, NORMALS)
     if name == "a.xyz":
         assert scan.weights is None
     else:

@@ -107,7 +107,7 @@ class Settings:
         """
         try:
             values = json.loads(text)
-        except json.JSONDecodeError as error:
+        except (ValueError, RecursionError) as error:  # also of numbers of thousands of digits, and of depth
             raise ValueError(f"no JSON text: {error}.") from None
         if not isinstance(values, dict) or "scheme" not in values or "levels" not in values:
             raise ValueError("no recipe: it has no `scheme` and `levels`.")
@@ -174,10 +174,10 @@ def _plain(value: Any) -> Any:
 
 
 def _named(what: str, value: Any, known: Mapping[str, type[_M]]) -> _M:
-    if not isinstance(value, dict) or value.get("name") not in known:
-        name = value.get("name") if isinstance(value, dict) else value
+    name = value.get("name") if isinstance(value, dict) else value
+    if not isinstance(value, dict) or not isinstance(name, str) or name not in known:
         raise ValueError(f"`{what}` must have a `name`, one of {_or(known)}; got {name!r}.")
-    return _from_plain(what, known[value["name"]], {key: part for key, part in value.items() if key != "name"})
+    return _from_plain(what, known[name], {key: part for key, part in value.items() if key != "name"})
 
 
 def _from_plain(what: str, kind: type[_M], value: Any) -> _M:
@@ -186,7 +186,7 @@ def _from_plain(what: str, kind: type[_M], value: Any) -> _M:
     _refuse_others(f"`{what}`", value, {field.name for field in dataclasses.fields(kind) if field.init})
     try:
         return kind(**{name: _from_json_value(part) for name, part in value.items()})
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
         raise ValueError(f"`{what}` is not as it should be: {error}") from None
 
 
@@ -204,7 +204,10 @@ def _checked(what: str, value: Any, kinds: type | tuple[type, ...]) -> Any:
 
 
 def _number(what: str, value: Any) -> float:
-    return float(_checked(what, value, (int, float)))
+    try:
+        return float(_checked(what, value, (int, float)))
+    except OverflowError:
+        raise ValueError(f"`{what}` is too large a number.") from None
 
 
 def _one_of(what: str, value: Any, choices: tuple[str | None, ...]) -> Any:

@@ -2,7 +2,6 @@
 
 import json
 import os
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 import jaxsubdiv as js
+from jaxsubdiv.archives import read_arrays
 from jaxsubdiv.files import replacing
 
 from ..finding import Origin
@@ -35,6 +35,7 @@ _VERSIONS = (3, 4)  # 1 had no likeness, 2 not what held the unknowns; 4 has str
 _FIT, _RECIPE = "fit.npz", "recipe.json"
 _ENDS = ("successful", "nonlinear_max_steps_reached", "nonlinear_divergence", "nonfinite")
 _OF_SCAN = ("points", "normals", "weights", "deviations", "slices")
+_MOST_FACES = 1 << 23  # of a refined surface; a fit of as many takes 25 GB
 _A_POINT = ("face", "uv", "directions", "distances", "weights", "precisions")
 
 
@@ -132,13 +133,13 @@ def load_fit(folder: str | os.PathLike[str]) -> tuple[Fit, str]:
         return _restore(arrays), recipe
     except KeyError as error:
         raise ValueError(f"{path}: {error.args[0]!r} is missing: the file is not one of a saved fit.") from None
-    except (ValueError, TypeError, IndexError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, TypeError, IndexError, AttributeError, AssertionError, OverflowError) as error:
+        # Arrays of other shapes than a fit has stop its mathematics in as many ways.
         raise ValueError(f"{path}: {error}") from None
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
-        arrays = dict(file)
+    arrays = {name: array for name, array in read_arrays(path, text=True).items() if array is not None}
     version = int(arrays["version"])
     if version not in _VERSIONS:
         what = "Update it" if version > _VERSIONS[-1] else f"Fit the scan again, by its {_RECIPE}"
@@ -201,8 +202,10 @@ def _restore(arrays: dict[str, np.ndarray]) -> Fit:
         return jnp.asarray(values, jnp.result_type(float) if values.dtype.kind == "f" else None)
 
     settings = Settings.from_json(str(arrays["settings"]))
-    scheme = settings.scheme
-    topology = settings.topology(js.ControlMesh(arrays["template"], {3: arrays["triangles"], 4: arrays["quads"]}))
+    scheme, mesh = settings.scheme, js.ControlMesh(arrays["template"], {3: arrays["triangles"], 4: arrays["quads"]})
+    if mesh.n_faces * 4 ** min(max(settings.levels, 0), 99) > _MOST_FACES:
+        raise ValueError(f"{settings.levels} levels of {mesh.n_faces} faces are more than a fit has. It is damaged.")
+    topology = settings.topology(mesh)
     start = js.Control(on_device("template"), on_device("start_normals"))
     scan = Scan(**{name: arrays.get(f"scan_{name}") for name in _OF_SCAN})
     inputs: dict[str, Any] = {"alike": arrays.get("alike")}

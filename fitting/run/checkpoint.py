@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxsubdiv as js
+from jaxsubdiv.archives import read_arrays
 from jaxsubdiv.files import replacing
 
 _FORMAT = 1  # of the files of a run; a new one where they, or what they are made from, come to mean something else
@@ -39,9 +39,8 @@ class Checkpoint:
         if not self.path.is_file():
             return None
         try:
-            with open(self.path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
-                arrays = dict(file)
-        except (ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+            arrays: dict[str, Any] = dict(read_arrays(self.path, text=True))
+        except (ValueError, OSError) as error:
             raise ValueError(f"{self.path} is no checkpoint: {error}. Delete it to start anew.") from None
         marks = {name.removeprefix(_INPUT): str(arrays.pop(name)) for name in list(arrays) if name.startswith(_INPUT)}
         others = differing(marks, self._marks)
@@ -61,11 +60,21 @@ class Checkpoint:
             np.savez(file, **whole)  # pyright: ignore[reportArgumentType]
 
     def read_tree(self, like: Any) -> Any:
-        """The pytree last written, in the structure of another; None where there is no file."""
+        """The pytree last written, in the structure of another; None where there is no file.
+
+        Raises:
+            ValueError: as `read` does, or the arrays are not those of such a pytree; the text names the first.
+        """
         arrays = self.read()
         if arrays is None:
             return None
         leaves, structure = jax.tree.flatten(like)
+        for i, leaf in enumerate(leaves):
+            if f"leaf {i}" not in arrays or arrays[f"leaf {i}"].shape != np.shape(leaf):
+                raise ValueError(
+                    f"{self.path} is no checkpoint of this fit: the array 'leaf {i}' is missing or of another shape. "
+                    "Delete it to start anew."
+                )
         return jax.tree.unflatten(structure, [_as(arrays[f"leaf {i}"], leaf) for i, leaf in enumerate(leaves)])
 
     def write_tree(self, tree: Any) -> None:

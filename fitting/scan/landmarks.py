@@ -1,6 +1,5 @@
 """Landmarks: the same few places named on the scan and on the template."""
 
-import csv
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -11,6 +10,7 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 import jaxsubdiv as js
+from jaxsubdiv.tables import decode, read_table
 
 from .scan import ScanError
 
@@ -35,13 +35,14 @@ class Placed(NamedTuple):
 
 
 def read_landmarks(path: str | Path, *, scale: float = 1.0) -> dict[str, Float[np.ndarray, "3"]]:
-    """Named positions from a JSON or CSV file.
+    """Named positions from a JSON or CSV file, or one of control points of 3D Slicer (`.mrk.json`, `.fcsv`).
 
     JSON holds an object of `"name": [x, y, z]`; a name may hold a list of positions as well, which become `name 1`,
-    `name 2` and so on. CSV holds rows of `name,x,y,z`, with or without a row of headings.
+    `name 2` and so on. CSV holds rows of `name,x,y,z`, or a row of headings that names x, y, z and the names' column
+    `name` or `label`. Control points stay in the frame of their file, and a warning says which it is.
 
     Args:
-        path: the file; its ending says which of the two it is.
+        path: the file; its ending says which it is.
         scale: multiplies the coordinates; 1000 takes metres to mm.
 
     Raises:
@@ -49,24 +50,24 @@ def read_landmarks(path: str | Path, *, scale: float = 1.0) -> dict[str, Float[n
             names the file and the landmark or line.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ScanError(f"landmarks cannot be read from {path}: {error}.") from error
-    readers = {".json": _json_rows, ".csv": _csv_rows}
+    readers = {".json": _json_rows, ".csv": _csv_rows, ".fcsv": _control_points}
     if path.suffix.lower() not in readers:
-        raise ScanError(f"{path}: landmarks are read from .json and .csv files, not from {path.suffix or 'this'}.")
+        raise ScanError(
+            f"{path}: landmarks are read from .json, .csv and .fcsv files, not from {path.suffix or 'this'}."
+        )
     landmarks: dict[str, Float[np.ndarray, "3"]] = {}
-    for name, where, values in readers[path.suffix.lower()](path, text):
-        try:
-            position = np.asarray(values, np.float64) * scale
-        except (TypeError, ValueError):
-            position = np.zeros(0)
-        if position.shape != (3,) or not np.isfinite(position).all():
-            raise ScanError(f"{path}, {where}: a landmark is three finite numbers x, y, z; got {values}.")
-        if name in landmarks:
-            raise ScanError(f"{path}, {where}: a landmark of the name '{name}' came before. Names must differ.")
-        landmarks[name] = position
+    try:
+        for name, where, values in readers[path.suffix.lower()](path):
+            position = np.array(values, np.float64) * scale if _are_three_numbers(values) else np.full(3, np.nan)
+            if not np.isfinite(position).all():
+                raise ScanError(f"{path}, {where}: a landmark is three finite numbers x, y, z; got {str(values)[:80]}.")
+            if name in landmarks:
+                raise ScanError(f"{path}, {where}: a landmark of the name '{name}' came before. Names must differ.")
+            landmarks[name] = position
+    except OSError as error:
+        raise ScanError(f"landmarks cannot be read from {path}: {error}.") from error
+    except js.MeshError as error:
+        raise ScanError(f"landmarks cannot be read from {path.parent / ''}{error}") from None
     if not landmarks:
         raise ScanError(f"{path} holds no landmarks.")
     return landmarks
@@ -134,13 +135,22 @@ def _vertices(rows: Int[np.ndarray, "l"], mesh: js.ControlMesh) -> Float[np.ndar
     return mesh.vertices[rows]
 
 
-def _json_rows(path: Path, text: str) -> Iterator[tuple[str, str, Any]]:
+def _are_three_numbers(values: Any) -> bool:
+    """Whether it is a list of three numbers that floating point holds."""
+    numbers = isinstance(values, list) and all(type(value) in (int, float) for value in values)
+    return numbers and len(values) == 3 and all(abs(value) < 1e300 for value in values)
+
+
+def _json_rows(path: Path) -> Iterator[tuple[str, str, Any]]:
     try:
-        content = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise ScanError(f"{path} is no JSON: {error}.") from error
+        content = json.loads(decode(path.read_bytes()))
+    except (ValueError, RecursionError) as error:  # also of numbers of thousands of digits, and of depth
+        raise ScanError(f"{path} is no JSON: {error}.") from None
     if not isinstance(content, dict):
         raise ScanError(f"{path}: landmarks in JSON are an object of names, each with its position [x, y, z].")
+    if "markups" in content:
+        yield from _control_points(path)
+        return
     for name, value in content.items():
         if isinstance(value, list) and value and all(isinstance(item, list) for item in value):
             yield from ((f"{name} {i}", f"'{name}'", item) for i, item in enumerate(value, 1))
@@ -148,9 +158,20 @@ def _json_rows(path: Path, text: str) -> Iterator[tuple[str, str, Any]]:
             yield name, f"'{name}'", value
 
 
-def _csv_rows(path: Path, text: str) -> Iterator[tuple[str, str, Any]]:
-    for line, row in enumerate(csv.reader(text.splitlines()), 1):
-        cells = [cell.strip() for cell in row]
-        if not any(cells) or (line == 1 and [cell.casefold() for cell in cells[1:]] == ["x", "y", "z"]):
-            continue
-        yield cells[0], f"line {line}", cells[1:]
+def _csv_rows(path: Path) -> Iterator[tuple[str, str, Any]]:
+    table = read_table(path)
+    names = table.headings or ["name", "x", "y", "z"]
+    known = [name for name in ("name", "label", "landmark") if name in names] or [
+        name for name in names if len(name) > 1
+    ]
+    if not {"x", "y", "z"} <= set(names[: table.n_columns]) or not known:
+        raise ScanError(f"{path}, line {table.line}: landmarks need the columns name, x, y and z; it has {names}.")
+    positions = table.numbers([names.index(axis) for axis in "xyz"]).tolist()
+    of_rows = zip(table.texts(names.index(known[0])), table.lines, positions, strict=True)
+    yield from ((name, f"line {line}", position) for name, line, position in of_rows)
+
+
+def _control_points(path: Path) -> Iterator[tuple[str, str, Any]]:
+    cloud, columns = js.read_labelled_points(path, ("label",))
+    for i, (name, position) in enumerate(zip(columns["label"], cloud.points.tolist(), strict=True)):
+        yield name or f"{i + 1}", f"control point {i}, counted from zero", position

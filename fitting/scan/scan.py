@@ -1,5 +1,6 @@
 """The scan: measured points, and what is known of each."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,11 +10,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 import jaxsubdiv as js
-from jaxsubdiv import read_texts, strong_float
+from jaxsubdiv import strong_float
 from jaxsubdiv.errors import name_rows
 from jaxsubdiv.linalg import of_moderate_length
 
 _LABELS, _SLICE = ("label", "contour"), "slice"
+_WHOLE = re.compile(r"[+-]?[0-9]{1,9}(\.0*)?")  # as large as 32 bits hold
 
 
 class ScanError(ValueError):
@@ -35,8 +37,8 @@ def _optional_whole(value: object) -> Array | None:
     if value is None:
         return None
     values = np.asarray(value)
-    if values.dtype.kind not in "iuf" or not np.all(np.isfinite(values) & (values == np.round(values))):
-        raise ScanError("`slices` must be whole numbers, one a point: number the slices.")
+    if values.dtype.kind not in "iuf" or not np.all((np.abs(values) < 2.0**31) & (values == np.round(values))):
+        raise ScanError("`slices` must be whole numbers below 2^31, one a point: number the slices.")
     return jnp.asarray(values, jnp.int32)
 
 
@@ -153,7 +155,8 @@ class Scan(eqx.Module):
 def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[str] = ()) -> Scan:
     """A scan from a file of points: PLY, XYZ, CSV, TXT, NPZ, VTP, or any mesh file, whose vertices are then the points.
 
-    A column `slice` of a CSV file, or another table with a header row, numbers the slices.
+    A column `slice` of a CSV file, or another table with a header row, numbers the slices. Points that are not finite
+    are dropped, with a warning; see `jaxsubdiv.read_points` for all that a file may hold.
 
     Args:
         path: the file.
@@ -165,12 +168,12 @@ def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[st
         ScanError: it holds no points, or none of these labels, and the text lists those that there are; or a slice has
             no whole number.
     """
-    path, cloud = Path(path), js.read_points(path, scale=scale)
-    columns = read_texts(path, (*_LABELS, _SLICE))
+    path = Path(path)
+    cloud, columns = js.read_labelled_points(path, (*_LABELS, _SLICE), scale=scale)
     slices = None if _SLICE not in columns else _numbers(path, columns[_SLICE])
     words = [labels] if isinstance(labels, str) else list(labels)
     if not words:
-        return Scan(*cloud, slices=slices)
+        return _scan(path, *cloud, None, slices)
     of_rows = next((columns[name] for name in _LABELS if name in columns), [])
     chosen = np.array([any(word.casefold() in one.casefold() for word in words) for one in of_rows], bool)
     if not chosen.any():
@@ -178,15 +181,22 @@ def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[st
         wanted = " or ".join(f"'{word}'" for word in words)
         raise ScanError(f"{path.name}: no row has a label that holds {wanted}. It has: {there}.")
     kept = (None if rows is None else rows[chosen] for rows in (*cloud, None, slices))
-    return Scan(*kept)
+    return _scan(path, *kept)
+
+
+def _scan(path: Path, *parts: np.ndarray | None) -> Scan:
+    try:
+        with np.errstate(over="ignore"):  # what passes single precision is not finite, and told as such
+            return Scan(*parts)
+    except ScanError as error:
+        raise ScanError(f"{path.name}: {error}") from None
 
 
 def _numbers(path: Path, texts: list[str]) -> Int[np.ndarray, "p"]:
-    try:
-        return np.array([int(text) for text in texts])
-    except ValueError:
-        bad = next(text for text in texts if not text.lstrip("+-").isdecimal())
+    bad = next((text for text in texts if not _WHOLE.fullmatch(text)), None)
+    if bad is not None:
         raise ScanError(
-            f"{path.name}: the column `{_SLICE}` has '{bad[:40]}', which is no whole number. Number the slices, or "
-            "rename the column where it is something else."
-        ) from None
+            f"{path.name}: the column `{_SLICE}` has '{bad[:40]}', which is no whole number of up to nine digits. "
+            "Number the slices, or rename the column where it is something else."
+        )
+    return np.array([int(text.partition(".")[0]) for text in texts])

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from .._mesh import ControlMesh
 from ..errors import MeshError, name_rows
 from ..files import replacing
-from . import _arrays, _gifti, _obj, _off, _ply, _stl, _table, _vtk
-from ._contents import Contents, VertexData, doubles
+from . import _arrays, _freesurfer, _gifti, _markups, _obj, _off, _ply, _stl, _table, _vtk, _vtp
+from ._contents import Contents, VertexData, doubles, warn
 
 __all__ = ["PointCloud", "Surface", "read_mesh", "read_points", "write_mesh"]
 
@@ -62,18 +62,20 @@ class _Format(NamedTuple):
 
 
 _TABLE = _Format(None, _table.read, None)
-_VTK = _Format(_vtk.read, _vtk.read, _vtk.write, holds_data=True)
+_MARKUPS = _Format(None, _markups.read, None)
 _FORMATS = {
-    ".obj": _Format(_obj.read, _obj.read, _obj.write),
-    ".ply": _Format(_ply.read, _ply.read, _ply.write, holds_data=True),
-    ".off": _Format(_off.read, _off.read, _off.write),
+    ".obj": _Format(_obj.read, _obj.read_points, _obj.write),
+    ".ply": _Format(_ply.read, _ply.read_points, _ply.write, holds_data=True),
+    ".off": _Format(_off.read, _off.read_points, _off.write),
     ".stl": _Format(_stl.read, _stl.read, _stl.write),
-    ".vtp": _VTK,
-    ".vtk": _VTK,
-    ".gii": _Format(_gifti.read, _gifti.read, _gifti.write),
+    ".vtp": _Format(_vtp.read, _vtp.read_points, _vtk.write, holds_data=True),
+    ".vtk": _Format(_vtk.read, _vtk.read_points, _vtk.write, holds_data=True),
+    ".gii": _Format(_gifti.read, _gifti.read_points, _gifti.write),
     ".npz": _Format(_arrays.read_npz, _arrays.read_points, _arrays.write),
+    ".asc": _Format(_freesurfer.read, _freesurfer.read_points, None),
     ".npy": _Format(None, _arrays.read_points, None),
-    **dict.fromkeys((".xyz", ".csv", ".txt", ".asc"), _TABLE),
+    **dict.fromkeys((".xyz", ".csv", ".txt"), _TABLE),
+    **dict.fromkeys((".json", ".fcsv"), _MARKUPS),
 }
 
 
@@ -113,8 +115,12 @@ def read_mesh(path: str | os.PathLike[str], *, scale: float | int = 1.0, check: 
     contents = format_.read_mesh(path)
     if contents.faces is None:
         raise MeshError(f"{path.name}: it holds points but no faces. Read it with `read_points`.")
+    vertices = _numbers(path.name, "vertices", contents.vertices, (None, 3))
+    normals = contents.normals
+    normals = None if normals is None else _numbers(path.name, "normals", normals, (len(vertices), 3))
     try:
-        return ControlMesh(np.asarray(contents.vertices) * scale, contents.faces, contents.normals, check=check)
+        with np.errstate(over="ignore", invalid="ignore"):  # areas of faces as large as numbers can be
+            return ControlMesh(_scaled(vertices, scale), contents.faces, normals, check=check)
     except MeshError as error:
         mend = " Read it with check=False to get there." if "repaired()" in str(error) else ""
         raise MeshError(f"{path.name}: {error}{mend}") from None
@@ -123,12 +129,18 @@ def read_mesh(path: str | os.PathLike[str], *, scale: float | int = 1.0, check: 
 def read_points(path: str | os.PathLike[str], *, scale: float | int = 1.0) -> PointCloud:
     """Points of a scan from a file, with normals and weights where it has them.
 
-    Every format of `read_mesh`, whose vertices are then the points, used or not, and:
+    Every format of `read_mesh`, whose vertices are then the points, used or not, whatever its faces are; and:
 
-    - `.xyz`, `.csv`, `.txt`, `.asc`: one point a line; commas, semicolons or white space part the columns; `#` begins a
-      comment. A header row names the columns, of `x y z nx ny nz weight` in any order; others are left out. Without one
-      there are 3 columns, or 6 with the normals.
+    - `.xyz`, `.csv`, `.txt`, `.asc`: one point a line; commas, semicolons, tabs or white space part the columns; `#`,
+      `//` and `;` begin comments. A header row names the columns, of `x y z nx ny nz weight` in any order, with units
+      or as ParaView writes them; others are left out. Without one the first three columns are x, y and z, and three
+      others are the normals where their lengths are near 1; a warning says what was left out. Decimals may have commas
+      where these do not part the columns; a first row may give the number of points.
     - `.npz`: `points`, and `normals` and `weights` if present. `.npy`: one array `[p, 3]`.
+    - `.mrk.json`, `.fcsv`: control points of 3D Slicer, in the frame that the file names; a warning says which.
+
+    Points that are not finite are dropped, and a warning counts them. Normals that are not finite become zero, which
+    says that a point has none; `normals` is None where no point has one.
 
     Args:
         path: the file.
@@ -136,26 +148,51 @@ def read_points(path: str | os.PathLike[str], *, scale: float | int = 1.0) -> Po
 
     Raises:
         FileNotFoundError: there is no such file.
-        MeshError: the file is not what its suffix says, or damaged, or has no points; or a coordinate, a normal or a
-            weight is not finite. The text names the file and the lines or rows.
-        ImportError: the format needs a library of the extra `io` which is not installed.
+        MeshError: the file is not what its suffix says, or damaged, or has no points; or a weight is not finite. The
+            text names the file and the lines or rows.
         ValueError: `scale` is not positive and finite.
     """
+    return read_labelled_points(path, (), scale=scale)[0]
+
+
+def read_labelled_points(
+    path: str | os.PathLike[str], names: Sequence[str], *, scale: float | int = 1.0
+) -> tuple[PointCloud, dict[str, list[str]]]:
+    """The points of `read_points`, and columns of text beside them: those of the names that a table's header has."""
     path, format_ = _open(path)
     _check_scale(scale)
     contents = format_.read_points(path)
-    points = _numbers(path.name, "points", contents.vertices, (None, 3))
-    if len(points) == 0:
-        raise MeshError(f"{path.name}: it holds no points.")
+    points = _scaled(_numbers(path.name, "points", contents.vertices, (None, 3)), scale)
     n = len(points)
     normals = None if contents.normals is None else _numbers(path.name, "normals", contents.normals, (n, 3))
     weights = None if contents.weights is None else _numbers(path.name, "weights", contents.weights, (n,))
-    return PointCloud(points * scale, normals, weights)
+    kept = _finite_rows(points)
+    if not kept.any():
+        dropped = f" All {n} rows have coordinates that are not finite." if n else ""
+        raise MeshError(f"{path.name}: it holds no points.{dropped}")
+    if not kept.all():
+        rows = name_rows(np.flatnonzero(~kept))
+        warn(
+            path, f"{n - kept.sum()} of {n} points are not finite (rows {rows}, counted from zero); they were dropped."
+        )
+    cloud = PointCloud(
+        points[kept],
+        None if normals is None else _present(path, normals[kept]),
+        None if weights is None else _finite(path.name, "weights", weights[kept]),
+    )
+    texts = {name: contents.texts[name] for name in names if name in contents.texts}
+    return cloud, {
+        name: [text for text, keep in zip(column, kept, strict=True) if keep] for name, column in texts.items()
+    }
 
 
-def read_texts(path: Path, names: Sequence[str]) -> dict[str, list[str]]:
-    """Columns of text beside the points of `read_points`, row by row: those of the names that a table's header has."""
-    return _table.read_texts(path, names) if _FORMATS[path.suffix.lower()] is _TABLE else {}
+def _present(path: Path, normals: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"] | None:
+    """The normals, zero where they are not finite; None where no point has one."""
+    finite = _finite_rows(normals)
+    if not finite.all():
+        warn(path, f"{(~finite).sum()} of {len(finite)} normals are not finite; these points count as without one.")
+        normals = np.where(finite[:, None], normals, 0)
+    return normals if normals.any() else None
 
 
 def write_mesh(
@@ -233,8 +270,10 @@ def _check_scale(scale: float | int) -> None:
 
 def _contents(path: Path, mesh: Surface) -> Contents:
     """The arrays of what is to be written, checked as far as a reader must be able to rely on them."""
-    vertices = _numbers(path.name, "vertices", mesh.vertices, (None, 3))
-    normals = None if mesh.normals is None else _numbers(path.name, "normals", mesh.normals, (len(vertices), 3))
+    vertices = _finite(path.name, "vertices", _numbers(path.name, "vertices", mesh.vertices, (None, 3)))
+    normals = mesh.normals
+    if normals is not None:
+        normals = _finite(path.name, "normals", _numbers(path.name, "normals", normals, (len(vertices), 3)))
     faces = {size: np.asarray(mesh.faces.get(size, np.zeros((0, size), int))) for size in (3, 4)}
     if set(mesh.faces) - {3, 4} or any(
         block.dtype.kind not in "iu" or block.shape != (len(block), size) for size, block in faces.items()
@@ -266,7 +305,7 @@ def _vertex_data(data: Mapping[str, ArrayLike], n_vertices: int) -> VertexData:
 
 
 def _numbers(file: str, name: str, values: Any, shape: tuple[int | None, ...]) -> np.ndarray:
-    """Finite float64 of a shape, where None is any length; or an error with the rows that are not."""
+    """Float64 of a shape, where None is any length."""
     array = np.asarray(values)
     fits = array.ndim == len(shape) and all(n in (None, own) for n, own in zip(shape, array.shape, strict=True))
     if not fits or array.dtype.kind not in "iuf":
@@ -275,8 +314,21 @@ def _numbers(file: str, name: str, values: Any, shape: tuple[int | None, ...]) -
             f"{file}: `{name}` must be numbers of the shape [{wanted}]; got {array.dtype} of the shape "
             f"{list(array.shape)}."
         )
-    array = doubles(array)
-    bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
+    return doubles(array)
+
+
+def _finite(file: str, name: str, array: np.ndarray) -> np.ndarray:
+    """The array, or an error with the rows that are not finite."""
+    bad = np.flatnonzero(~_finite_rows(array))
     if len(bad):
         raise MeshError(f"{file}: {name} {name_rows(bad)}, counted from zero, are not finite. Drop these rows.")
     return array
+
+
+def _finite_rows(array: np.ndarray) -> Bool[np.ndarray, "n"]:
+    return np.asarray(np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
+
+
+def _scaled(array: np.ndarray, scale: float | int) -> np.ndarray:
+    with np.errstate(over="ignore"):  # what passes the largest number is not finite, and told as such
+        return array * scale

@@ -1,11 +1,12 @@
-"""NPZ and NPY files, by numpy."""
+"""NPZ and NPY files."""
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import MeshError
+from ..archives import read_arrays
+from ..errors import MeshError, name_rows
 from ._contents import Contents, VertexData
 
 _MESHES = (
@@ -16,34 +17,34 @@ _MESHES = (
 
 def read_npz(path: Path) -> Contents:
     """A mesh: `control_points`, `control_faces`, or `vertices` and `faces`, or `triangles` and `quads`; and normals."""
-    arrays = _load(path)
-    if not isinstance(arrays, dict):
+    arrays = _load(path, {name for vertices, normals, faces in _MESHES for name in (vertices, normals, *faces)})
+    if "" in arrays:
         raise MeshError(
             f"{path.name}: it holds one array without a name, so points at most. Read it with `read_points`."
         )
     for vertices, normals, faces in _MESHES:
-        if vertices in arrays:
-            blocks = [arrays[name] for name in faces if name in arrays]
-            return Contents(arrays[vertices], _by_columns(path, blocks) if blocks else None, arrays.get(normals))
+        if (found := arrays.get(vertices)) is not None:
+            blocks = [block for name in faces if (block := arrays.get(name)) is not None]
+            return Contents(found, _by_columns(path, blocks) if blocks else None, arrays.get(normals))
     raise MeshError(
         f"{path.name}: a mesh needs the arrays `control_points` and `control_faces`, or `vertices` with `faces`, "
-        f"`triangles` or `quads`. It has {', '.join(arrays) or 'none'}."
+        f"`triangles` or `quads`. It has {name_rows(arrays) or 'none'}."
         + (" Read it with `read_points`." if "points" in arrays else "")
     )
 
 
 def read_points(path: Path) -> Contents:
     """`points`, `normals`, `weights`; the vertices of a mesh where there are no `points`; or one bare array."""
-    arrays = _load(path)
-    if not isinstance(arrays, dict):
-        return Contents(arrays)
-    if "points" in arrays:
-        return Contents(arrays["points"], None, arrays.get("normals"), arrays.get("weights"))
-    if any(vertices in arrays for vertices, _, _ in _MESHES):
-        return read_npz(path)
+    of_meshes = {name for vertices, normals, _ in _MESHES for name in (vertices, normals)}
+    arrays = _load(path, {"", "points", "weights"} | of_meshes)
+    if (points := arrays.get("points", arrays.get(""))) is not None:
+        return Contents(points, None, arrays.get("normals"), arrays.get("weights"))
+    for vertices, normals, _ in _MESHES:
+        if (found := arrays.get(vertices)) is not None:
+            return Contents(found, None, arrays.get(normals))
     raise MeshError(
         f"{path.name}: the array `points` is missing, and so are `control_points` and `vertices`. It has "
-        f"{', '.join(arrays) or 'none'}."
+        f"{name_rows(arrays) or 'none'}."
     )
 
 
@@ -57,16 +58,11 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
         np.savez(file, **arrays)
 
 
-def _load(path: Path) -> dict[str, np.ndarray] | np.ndarray:
+def _load(path: Path, wanted: set[str]) -> dict[str, np.ndarray | None]:
     try:
-        with path.open("rb") as file:
-            loaded = np.load(file, allow_pickle=False)  # a pickle may run any code
-            return loaded if isinstance(loaded, np.ndarray) else {name: loaded[name] for name in loaded.files}
-    except Exception as error:  # zipfile, zlib and numpy each raise their own
-        raise MeshError(
-            f"{path.name}: numpy cannot read it without unpickling ({error}). It is damaged, of another format, or "
-            "holds objects: save plain arrays of numbers."
-        ) from None
+        return read_arrays(path, wanted.__contains__)
+    except ValueError as error:
+        raise MeshError(f"{path.name}: {error}.") from None
 
 
 def _by_columns(path: Path, blocks: list[np.ndarray]) -> dict[int, np.ndarray]:

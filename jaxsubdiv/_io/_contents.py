@@ -4,6 +4,7 @@ import importlib
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +21,8 @@ class Contents(NamedTuple):
     """Polygon size (3 or 4) -> corners of the faces of that size, zero-based; None where there are points alone."""
     normals: Float[np.ndarray, "v 3"] | None = None
     weights: Float[np.ndarray, "v"] | None = None
+    texts: Mapping[str, list[str]] = MappingProxyType({})
+    """Columns of text beside the points, by heading."""
 
 
 VertexData = Mapping[str, Shaped[np.ndarray, "v"]]
@@ -43,8 +46,8 @@ def warn(path: Path, text: str) -> None:
 
 
 def doubles(values: Shaped[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """A copy in float64; a NaN of any make stays one without a warning, to be named later by its row."""
-    with np.errstate(invalid="ignore"):
+    """A copy in float64; what is not finite there is so without a warning, to be named later by its row."""
+    with np.errstate(invalid="ignore", over="ignore"):
         return values.astype(np.float64)
 
 

@@ -1,13 +1,30 @@
-"""GIfTI surfaces, by nibabel."""
+"""GIfTI surfaces; nibabel writes them.
 
+Not read by nibabel: some numbers in a damaged file make it loop without end.
+"""
+
+import math
+import re
 from pathlib import Path
+from typing import NoReturn
+from xml.etree.ElementTree import Element
 
 import numpy as np
+from jaxtyping import Float, Shaped
 
 from ..errors import MeshError
+from . import _xml
 from ._contents import Contents, VertexData, doubles, library, warn, whole
+from ._text import parse_rows
 
 _NORMALS = "Normals"
+_TYPES = {
+    **{"UINT8": "u1", "INT8": "i1", "UINT16": "u2", "INT16": "i2", "UINT32": "u4", "INT32": "i4", "UINT64": "u8"},
+    **{"INT64": "i8", "FLOAT32": "f4", "FLOAT64": "f8"},
+}
+_CODES = {"2": "u1", "4": "i2", "8": "i4", "16": "f4", "64": "f8", "256": "i1", "512": "u2", "768": "u4", "1024": "i8"}
+_INTENTS = {"1008": "POINTSET", "1009": "TRIANGLE", "1007": "VECTOR"}
+_ENCODINGS = {"1": "ASCII", "2": "Base64Binary", "3": "GZipBase64Binary", "4": "ExternalFileBinary"}
 
 
 def read(path: Path) -> Contents:
@@ -16,32 +33,96 @@ def read(path: Path) -> Contents:
     Coordinates stay as they are stored. A coordinate transform other than the identity is not applied, and a warning
     says so: several programs store one to a space that the surface was never meant for.
     """
-    gifti = library("nibabel.gifti", ".gii files")
-    try:
-        arrays = gifti.GiftiImage.from_bytes(path.read_bytes()).darrays
-    except Exception as error:  # whatever the XML parser and the decoders raise
-        raise MeshError(f"{path.name}: nibabel cannot read it as GIfTI ({error}). It is damaged or no GIfTI.") from None
-    points = [array for array in arrays if array.intent == _intent("POINTSET")]
-    triangles = [array for array in arrays if array.intent == _intent("TRIANGLE")]
-    vectors = [array for array in arrays if array.intent == _intent("VECTOR")]
-    normals = [array for array in vectors if array.meta.get("Name", "").lower() == _NORMALS.lower()]
-    if len(points) != 1 or len(triangles) > 1:
+    arrays = _arrays(path)
+    triangles = [array for array in arrays if _intent(array) == "TRIANGLE"]
+    return _points(path, arrays)._replace(faces={3: whole(path, _rows(path, triangles[0]))} if triangles else None)
+
+
+def read_points(path: Path) -> Contents:
+    """The point set and the normals, whatever the triangles are."""
+    return _points(path, _arrays(path))
+
+
+def _arrays(path: Path) -> list[Element]:
+    arrays = _xml.parse(path, path.read_bytes(), "GIFTI").findall("DataArray")
+    n = {kind: sum(_intent(array) == kind for array in arrays) for kind in ("POINTSET", "TRIANGLE")}
+    if n["POINTSET"] != 1 or n["TRIANGLE"] > 1:
         raise MeshError(
-            f"{path.name}: it holds {len(points)} point sets and {len(triangles)} triangle arrays; one of each makes a "
-            "surface. Files of measurements on a surface (.func.gii, .label.gii) go with a .surf.gii file."
+            f"{path.name}: it holds {n['POINTSET']} point sets and {n['TRIANGLE']} triangle arrays; one of each makes "
+            "a surface. Files of measurements on a surface (.func.gii, .label.gii) go with a .surf.gii file."
         )
-    transform = points[0].coordsys
-    if transform is not None and not np.array_equal(transform.xform, np.eye(4)):
-        warn(
-            path,
-            "it carries a coordinate transform, which was not applied: vertices are as stored. Apply "
-            "`darrays[0].coordsys.xform` of nibabel's image where the other space is wanted.",
-        )
-    return Contents(
-        doubles(points[0].data),
-        {3: whole(path, triangles[0].data)} if triangles else None,
-        doubles(normals[0].data) if normals else None,
-    )
+    return arrays
+
+
+def _points(path: Path, arrays: list[Element]) -> Contents:
+    points = next(array for array in arrays if _intent(array) == "POINTSET")
+    vectors = [array for array in arrays if _intent(array) == "VECTOR"]
+    normals = [array for array in vectors if _meta_name(array).lower() == _NORMALS.lower()]
+    for transform in points.findall("CoordinateSystemTransformMatrix/MatrixData"):
+        values = parse_rows(path, transform.text or "").values
+        if not np.array_equal(values, np.eye(4).ravel()):
+            warn(
+                path,
+                "it carries a coordinate transform, which was not applied: vertices are as stored. Apply "
+                "`darrays[0].coordsys.xform` of nibabel's image where the other space is wanted.",
+            )
+            break
+    return Contents(doubles(_rows(path, points)), None, doubles(_rows(path, normals[0])) if normals else None)
+
+
+def _intent(array: Element) -> str:
+    intent = array.get("Intent", "").removeprefix("NIFTI_INTENT_")
+    return _INTENTS.get(intent, intent)
+
+
+def _meta_name(array: Element) -> str:
+    pairs = array.findall("MetaData/MD")
+    return next(
+        (pair.findtext("Value") or "" for pair in pairs if (pair.findtext("Name") or "").strip() == "Name"), ""
+    ).strip()
+
+
+def _rows(path: Path, array: Element) -> Shaped[np.ndarray, "n 3"]:
+    """The numbers of a data array, three a row."""
+    try:
+        values, shape = _values(path, array), _shape(array)
+    except ValueError as error:
+        text = str(error).removeprefix(f"{path.name}, ")
+        raise MeshError(
+            f"{path.name}: the array {_intent(array)[:40]}: {text}. The file is cut off or damaged."
+        ) from None
+    return values.reshape(shape, order="F" if array.get("ArrayIndexingOrder") in ("ColumnMajorOrder", "2") else "C")
+
+
+def _values(path: Path, array: Element) -> Shaped[np.ndarray, "n"]:
+    kind, n = array.get("DataType", "").removeprefix("NIFTI_TYPE_"), math.prod(_shape(array))
+    dtype = np.dtype(_TYPES.get(kind) or _CODES.get(kind) or _unknown(f"the type '{kind[:40]}' is not read"))
+    dtype = dtype.newbyteorder(">" if array.get("Endian") in ("BigEndian", "1") else "<")
+    encoding, text = array.get("Encoding", ""), array.findtext("Data") or ""
+    match _ENCODINGS.get(encoding, encoding):
+        case "ASCII":
+            values: Float[np.ndarray, "n"] = parse_rows(path, text).values
+        case "Base64Binary":
+            data = _xml.from_base64(text)
+            values = np.frombuffer(data, dtype, len(data) // dtype.itemsize)
+        case "GZipBase64Binary":
+            values = np.frombuffer(_xml.unpack(_xml.from_base64(text), n * dtype.itemsize), dtype)
+        case other:
+            _unknown(f"the encoding '{other[:40]}' is not read; save it with GZipBase64Binary")
+    if len(values) != n:
+        raise ValueError(f"{n} numbers are announced, but there are {len(values)}")
+    return values
+
+
+def _shape(array: Element) -> tuple[int, int]:
+    sizes = [array.get("Dim0", ""), array.get("Dim1", "1")]
+    if not all(re.fullmatch("[0-9]{1,18}", size) for size in sizes) or sizes[1] != "3":
+        raise ValueError(f"its size is {' x '.join(size[:20] for size in sizes)}, where rows of three are expected")
+    return int(sizes[0]), 3
+
+
+def _unknown(what: str) -> NoReturn:
+    raise ValueError(what)
 
 
 def write(path: Path, contents: Contents, data: VertexData) -> None:
@@ -66,7 +147,3 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
         meta = gifti.GiftiMetaData({"Name": _NORMALS})
         arrays.append(gifti.GiftiDataArray(normals, "NIFTI_INTENT_VECTOR", "NIFTI_TYPE_FLOAT32", meta=meta))
     path.write_bytes(gifti.GiftiImage(darrays=arrays).to_bytes())
-
-
-def _intent(name: str) -> int:
-    return library("nibabel.nifti1", ".gii files").intent_codes.code[f"NIFTI_INTENT_{name}"]

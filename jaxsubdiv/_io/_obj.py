@@ -11,8 +11,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..errors import MeshError, name_rows
+from ..tables import decode
+from . import _mni
 from ._contents import Contents, VertexData, by_size, warn
-from ._text import Rows, decode, face_lines, number_lines, parse_rows, token_starts, tokens_per_line
+from ._text import Rows, face_lines, number_lines, parse_rows, token_starts, tokens_per_line
 
 _INDEX = r"[+-]?[0-9]{1,9}"  # a mesh of more vertices would not fit 32 bits
 _CORNER = re.compile(f"{_INDEX}(/{_INDEX}|/({_INDEX})?/{_INDEX})?")
@@ -41,18 +43,63 @@ class _Corners(NamedTuple):
 
 def read(path: Path) -> Contents:
     """`v`, `vn` and `f`; every other statement is left out, and so are the numbers after `v x y z`."""
-    lines = _logical_lines(decode(path.read_bytes()))
-    v, vn, f = lines.of("v"), lines.of("vn"), lines.of("f")
-    vertices, normals = _triples(path, lines, v, "v"), _triples(path, lines, vn, "vn")
+    data = path.read_bytes()
+    if _mni.is_mni(data):
+        return _mni.read(path, data)
+    lines = _logical_lines(decode(data))
+    vertices, normals, f = _vertices(path, lines)
     if len(f) == 0:
         return Contents(vertices, None, normals if len(normals) == len(vertices) > 0 else None)
     corners = _corners(path, lines, f)
+    odd = (corners.sizes < 3) | (corners.sizes > 4)
+    if odd.any():
+        raise MeshError(
+            f"{path.name}, line {name_rows(lines.numbers[f[odd]])}: a face of {corners.sizes[odd][0]} corners. Split "
+            "larger faces into triangles and quads, and drop smaller ones."
+        )
+    vertex, per_vertex = _indices(path, lines, f, corners, normals, len(vertices))
+    faces = by_size(vertex, np.cumsum(corners.sizes) - corners.sizes, corners.sizes)
+    return Contents(vertices, faces, per_vertex)
+
+
+def read_points(path: Path) -> Contents:
+    """`v` and `vn`; faces, of any size, are read only for which normal belongs to which vertex."""
+    data = path.read_bytes()
+    if _mni.is_mni(data):
+        return _mni.read_points(path, data)
+    lines = _logical_lines(decode(data))
+    vertices, normals, f = _vertices(path, lines)
+    if len(normals) == len(vertices) or len(normals) == 0 or len(f) == 0:
+        return Contents(vertices, None, normals if len(normals) == len(vertices) > 0 else None)
+    try:
+        _, per_vertex = _indices(path, lines, f, _corners(path, lines, f), normals, len(vertices))
+    except MeshError as error:
+        warn(path, f"the normals were left out, since the faces do not say whose they are: {error}")
+        per_vertex = None
+    return Contents(vertices, None, per_vertex)
+
+
+def _vertices(
+    path: Path, lines: _Lines
+) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "n 3"], Int[np.ndarray, "f"]]:
+    """Vertices, normals, and where the faces stand."""
+    return _triples(path, lines, lines.of("v"), "v"), _triples(path, lines, lines.of("vn"), "vn"), lines.of("f")
+
+
+def _indices(
+    path: Path,
+    lines: _Lines,
+    f: Int[np.ndarray, "f"],
+    corners: _Corners,
+    normals: Float[np.ndarray, "n 3"],
+    n_vertices: int,
+) -> tuple[Int[np.ndarray, "c"], Float[np.ndarray, "v 3"] | None]:
+    """The vertex of every corner, and the normal of every vertex."""
     of_face = np.repeat(f, corners.sizes)  # the statement of every corner
     named = corners.normal != 0
-    vertex = _zero_based(path, corners.vertex, v, lines, of_face, "v")
-    normal = _zero_based(path, corners.normal[named], vn, lines, of_face[named], "vn")
-    faces = by_size(vertex, np.cumsum(corners.sizes) - corners.sizes, corners.sizes)
-    return Contents(vertices, faces, _per_vertex(path, vertex, named, normal, normals, len(vertices)))
+    vertex = _zero_based(path, corners.vertex, lines.of("v"), lines, of_face, "v")
+    normal = _zero_based(path, corners.normal[named], lines.of("vn"), lines, of_face[named], "vn")
+    return vertex, _per_vertex(path, vertex, named, normal, normals, n_vertices)
 
 
 def write(path: Path, contents: Contents, data: VertexData) -> None:
@@ -109,12 +156,9 @@ def _corners(path: Path, lines: _Lines, at: Int[np.ndarray, "f"]) -> _Corners:
     raw = np.frombuffer(text.encode(), np.uint8)
     starts = token_starts(raw)
     sizes = tokens_per_line(raw, starts)
-    odd = (sizes < 3) | (sizes > 4)
-    if odd.any():
-        raise MeshError(
-            f"{path.name}, line {name_rows(lines.numbers[at[odd]])}: a face of {sizes[odd][0]} corners. Split larger "
-            "faces into triangles and quads, and drop smaller ones."
-        )
+    if not sizes.any():
+        none = np.zeros(0, int)
+        return _Corners(none, none, sizes)
     slashes = np.flatnonzero(raw == ord("/"))
     parts = 1 + np.diff(np.searchsorted(slashes, np.append(starts[1:], len(raw))), prepend=0)
     try:

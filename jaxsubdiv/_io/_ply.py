@@ -3,6 +3,7 @@
 Not by meshio: it knows no `vertex_index`, misreads numbers beside a face's list, and ends the interpreter on bad files.
 """
 
+import re
 import struct
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +20,7 @@ _TYPES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"int64": "i8", "uint64": "u8", "float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
 }
+_LENGTHS = {name for name, type_ in _TYPES.items() if type_[0] in "iu"}
 _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"} | {
     "f4": "float",
     "f8": "double",
@@ -61,15 +63,31 @@ _Columns = dict[str, Shaped[np.ndarray, "n"] | _Lists]
 
 def read(path: Path) -> Contents:
     """Vertices, their normals where all of nx, ny and nz are there, and faces. Everything else is left out."""
+    columns = _read_columns(path, {"vertex", "face"})
+    return _vertices(path, columns)._replace(faces=_faces(path, columns.get("face", {})))
+
+
+def read_points(path: Path) -> Contents:
+    """Vertices and their normals; what comes after the vertices is not read."""
+    return _vertices(path, _read_columns(path, {"vertex"}))
+
+
+def _read_columns(path: Path, wanted: set[str]) -> dict[str, _Columns]:
+    """Columns by element, up to the last of those that are wanted."""
     data = path.read_bytes()
     header = _read_header(path, data)
-    columns = _read_binary(path, data, header) if header.order else _read_text(path, data, header)
+    last = max((i for i, element in enumerate(header.elements) if element.name in wanted), default=-1)
+    header = header._replace(elements=header.elements[: last + 1])
+    return _read_binary(path, data, header) if header.order else _read_text(path, data, header)
+
+
+def _vertices(path: Path, columns: dict[str, _Columns]) -> Contents:
     if "vertex" not in columns:
         raise MeshError(f"{path.name}: there is no element 'vertex', so no coordinates to read.")
     vertices = _triple(columns["vertex"], _POSITION)
     if vertices is None:
         raise MeshError(f"{path.name}: the element 'vertex' needs the properties x, y and z.")
-    return Contents(vertices, _faces(path, columns.get("face", {})), _triple(columns["vertex"], _NORMAL))
+    return Contents(vertices, None, _triple(columns["vertex"], _NORMAL))
 
 
 def write(path: Path, contents: Contents, data: VertexData) -> None:
@@ -130,14 +148,14 @@ def _read_header(path: Path, data: bytes) -> _Header:
         match words:
             case ["format", kind, _] if kind in _BYTE_ORDERS:
                 order = _BYTE_ORDERS[kind]
-            case ["element", name, count] if count.isdecimal():
+            case ["element", name, count] if re.fullmatch("[0-9]{1,18}", count):
                 elements.append(_Element(name, int(count), []))
-            case ["property", "list", length, type_, name] if elements and {length, type_} <= set(_TYPES):
+            case ["property", "list", length, type_, name] if elements and length in _LENGTHS and type_ in _TYPES:
                 elements[-1].properties.append(_Property(name, _TYPES[type_], _TYPES[length]))
             case ["property", type_, name] if elements and type_ in _TYPES:
                 elements[-1].properties.append(_Property(name, _TYPES[type_], None))
             case ["end_header"] if order is not None:
-                _check_names(path, elements)
+                _check_elements(path, elements, len(data) - at)
                 return _Header(order, elements, at, number)
             case ["end_header"]:
                 raise MeshError(f"{path.name}: the header has no line 'format'. Known are {', '.join(_BYTE_ORDERS)}.")
@@ -150,8 +168,16 @@ def _read_header(path: Path, data: bytes) -> _Header:
                 )
 
 
-def _check_names(path: Path, elements: list[_Element]) -> None:
+def _check_elements(path: Path, elements: list[_Element], n_bytes: int) -> None:
+    """Raise where names come twice, or more rows are announced than the rest of the file has bytes."""
+    if len({element.name for element in elements}) < len(elements):
+        raise MeshError(f"{path.name}: the header has two elements of one name. Rename one.")
     for element in elements:
+        if element.n_rows > n_bytes:
+            raise MeshError(
+                f"{path.name}: the header announces {element.n_rows} rows of '{element.name}', but only {n_bytes} "
+                "bytes follow. The file is cut off, or its header is wrong."
+            )
         names = [item.name for item in element.properties]
         if len(set(names)) < len(names):
             raise MeshError(f"{path.name}: the element '{element.name}' has two properties of one name. Rename one.")

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..errors import MeshError, name_rows
+from ..tables import decode
 from ._contents import Contents, VertexData, doubles, warn
-from ._text import decode, parse_rows
+from ._text import parse_rows
 
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
 _HEADER = 84  # 80 bytes of anything, then the number of facets
@@ -23,10 +24,14 @@ def read(path: Path) -> Contents:
     """
     data = path.read_bytes()
     n_facets = int.from_bytes(data[80:_HEADER], "little")
-    # Binary files may begin with "solid" too, so only their length tells.
-    if len(data) == _HEADER + n_facets * _FACET.itemsize:
-        corners = doubles(np.frombuffer(data, _FACET, offset=_HEADER)["corners"]).reshape(-1, 3)
-    elif data.lstrip()[:5].lower() == b"solid":
+    trailing = len(data) - _HEADER - n_facets * _FACET.itemsize
+    # Binary files may begin with "solid" too, so only their length tells: four letters of text announce more facets
+    # than any such file has.
+    if trailing == 0 or (trailing > 0 and n_facets > 0):
+        corners = doubles(np.frombuffer(data, _FACET, n_facets, _HEADER)["corners"]).reshape(-1, 3)
+        if trailing:
+            warn(path, f"{trailing} bytes after the last of {n_facets} triangles were left out.")
+    elif data.lstrip()[:5].lower() == b"solid" and b"\0" not in data[:_HEADER]:
         corners = _text_corners(path, decode(data))
     else:
         raise MeshError(
@@ -53,6 +58,11 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
 
 def _text_corners(path: Path, text: str) -> Float[np.ndarray, "c 3"]:
     lines = [line.strip() for line in text.lower().rstrip().split("\n")]
+    ends = [i for i, line in enumerate(lines) if line.startswith("endsolid")]
+    rest = lines[ends[-1] + 1 :] if ends else []
+    if rest and not any(line.startswith(("facet", "vertex")) for line in rest):
+        warn(path, f"{len(rest)} lines after the last 'endsolid' were left out.")
+        lines = lines[: ends[-1] + 1]
     at = np.array([i for i, line in enumerate(lines) if line.startswith("vertex")], dtype=int)
     rows = parse_rows(path, "\n".join(lines[i][len("vertex") :] for i in at), at + 1)
     if len(rows.counts) < len(at) or (rows.counts != 3).any():

@@ -1,143 +1,114 @@
-"""Points as text: one a line, with or without a header row that names the columns."""
+"""Points as a table of text: which columns are coordinates, normals and weights."""
 
-import csv
-from collections.abc import Sequence
+import re
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 from jaxtyping import Float
 
 from ..errors import MeshError, name_rows
-from ._contents import Contents
-from ._text import decode
+from ..tables import Table, name_columns, read_table
+from ._contents import Contents, warn
 
 _POSITION, _NORMAL, _WEIGHT = ("x", "y", "z"), ("nx", "ny", "nz"), "weight"
-_POINT = "Write decimals with a point."
-_EXPECTED = (
-    "Without a header row there must be 3 columns (x, y, z) or 6 (x, y, z, nx, ny, nz); with others, name them in a "
-    "first row, of x, y, z, nx, ny, nz, weight. Columns of other names are left out."
+_WORDS = "|".join(("points?", "positions?", "pos", "coordinates?", "coords?"))
+_AXIS = r"[ _:.-]?([xyz012])"
+_ALIASES = (
+    (re.compile(f"(?:{_WORDS}){_AXIS}"), ""),
+    (re.compile(rf"([xyz])(?:[ _-]?(?:{_WORDS})|_(?:mm|cm|m|in))"), ""),
+    (re.compile(f"(?:normals?|norm|n){_AXIS}"), "n"),
+    (re.compile(r"(weight)s?"), ""),
+    (re.compile(r"(label|contour)[ _-](?:type|name)"), ""),
 )
+_NEAR_ONE = 0.05  # normals written with two digits have lengths as far from 1
 
 
 def read(path: Path) -> Contents:
-    """Points, and normals and weights where the file has them.
+    """Points, and normals and weights where the file has them; see `tables.read_table` for how rows may be written.
 
-    Commas, semicolons or white space part the columns. A header row names them in any order, and those of other names
-    are left out. Without one there are 3 columns, or 6 with the normals. What follows a `#` is a comment.
+    Headings name the columns in any order, and those of other names are left out. Without headings the first three
+    columns are the coordinates, and the first three others whose lengths are near 1, some of them with a minus sign,
+    the normals; a warning says what was left out.
     """
-    rows, delimiter = _rows(path)
-    number, first = rows[0]
-    cells = _split(first, delimiter)
-    if all(map(_is_number, cells)):
-        if len(cells) not in (3, 6):
-            raise MeshError(f"{path.name}, line {number}: {len(cells)} columns. {_EXPECTED}")
-        names = [*_POSITION, *_NORMAL][: len(cells)]
-    elif all(_is_number(part.replace(",", ".")) for part in first.split()):
-        raise MeshError(f"{path.name}, line {number}: '{first.split()[0][:40]}' is not a number. {_POINT}")
-    else:
-        names = [cell.lower() for cell in cells]
-        _check_names(path, number, names)
-        rows = rows[1:]
-    wanted = [name for name in (*_POSITION, *_NORMAL, _WEIGHT) if name in names]
-    table = _numbers(path, rows, delimiter, [names.index(name) for name in wanted], len(names))
-    bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
-    if len(bad):
-        raise MeshError(
-            f"{path.name}, line {name_rows(rows[i][0] for i in bad)}: a number is not finite. Delete these rows."
-        )
-    has_normals, has_weights = "nx" in wanted, _WEIGHT in wanted
-    headless = len(rows) > 0 and rows[0][0] == number
-    whole = not any("." in text for _, text in rows)
-    if headless and whole and len(names) == 6 and delimiter == "," and _are_halves(table):
-        raise MeshError(
-            f"{path.name}: 6 columns of whole numbers, the last three of them no normals: decimal commas, it seems. "
-            "Write decimals with a point, or name the columns in a first row."
-        )
-    return Contents(table[:, :3], None, table[:, 3:6] if has_normals else None, table[:, -1] if has_weights else None)
+    table = read_table(path)
+    return _by_headings(path, table) if table.headings else _by_place(path, table)
 
 
-def _are_halves(table: Float[np.ndarray, "p 6"]) -> bool:
-    """Whether rows of six whole numbers are three that were cut at their decimal commas: 1,25 read as 1 and 25."""
-    return bool(np.median(np.linalg.norm(table[:, 3:6], axis=1)) > 2)  # of normals it is about 1
-
-
-def read_texts(path: Path, names: Sequence[str]) -> dict[str, list[str]]:
-    """Those of the named columns that the header row names, as text; the rows are those of `read`."""
-    rows, delimiter = _rows(path)
-    header = [cell.lower() for cell in _split(rows[0][1], delimiter)]
-    places = {name: header.index(name) for name in names if name in header}
-    if not places:
-        return {}
-    cells = [_split(text, delimiter) for _, text in rows[1:]]
-    return {name: [row[place] for row in cells] for name, place in places.items()}
-
-
-def _rows(path: Path) -> tuple[list[tuple[int, str]], str | None]:
-    """Lines that hold something, with their numbers, and what parts their columns."""
-    lines = enumerate(decode(path.read_bytes()).split("\n"), start=1)
-    rows = [(number, text) for number, line in lines if (text := line.partition("#")[0].strip())]
-    if not rows:
-        raise MeshError(f"{path.name}: it has no line of numbers.")
-    first = rows[0][1]
-    return rows, ";" if ";" in first else "," if "," in first else None
-
-
-def _check_names(path: Path, number: int, names: list[str]) -> None:
+def _by_headings(path: Path, table: Table) -> Contents:
+    names = [_known_name(name) for name in table.headings]
     known = [name for name in names if name in (*_POSITION, *_NORMAL, _WEIGHT)]
     n_normal = len(set(_NORMAL) & set(known))
     if not set(_POSITION) <= set(known) or n_normal not in (0, 3) or len(set(known)) < len(known):
         raise MeshError(
-            f"{path.name}, line {number}: a header row must name x, y and z, all of nx, ny, nz or none, and none "
-            f"twice; this one has {name_rows(names, 8)}. {_EXPECTED}"
+            f"{path.name}, line {table.line}: a header row must name x, y and z, all of nx, ny, nz or none, and none "
+            f"twice; this one has {name_rows(table.headings, 8)}. Columns of other names are left out."
         )
+    texts = {name: table.texts(place) for place, name in enumerate(names) if name not in known}
+    place = {name: names.index(name) for name in known}
+    points = table.numbers([place[name] for name in _POSITION])
+    normals = table.numbers([place[name] for name in _NORMAL]) if n_normal else None
+    weights = table.numbers([place[_WEIGHT]])[:, 0] if _WEIGHT in place else None
+    return Contents(points, None, normals, weights, texts)
 
 
-def _numbers(
-    path: Path, rows: list[tuple[int, str]], delimiter: str | None, places: Sequence[int], n_columns: int
-) -> Float[np.ndarray, "p c"]:
-    """The columns at `places` of rows that have `n_columns` each."""
-    if not rows:
-        return np.zeros((0, len(places)))
-    texts = [text for _, text in rows]
-    # Left to itself numpy takes only the columns asked for, so longer rows are told by counting.
-    n_parts = {text.count(delimiter) for text in texts} if delimiter else {len(text.split()) for text in texts}
-    if n_parts == {n_columns - 1 if delimiter else n_columns} or '"' in "".join(texts):
-        try:
-            return np.loadtxt(texts, delimiter=delimiter, usecols=places, ndmin=2, comments=None, quotechar='"')
-        except ValueError:
-            pass
-    _raise_bad_row(path, rows, delimiter, places, n_columns)
+def _known_name(heading: str) -> str:
+    """`x` for `Points:0`, `x coordinate` and the like; other headings stay."""
+    for pattern, before in _ALIASES:
+        if found := pattern.fullmatch(heading):
+            return before + {"0": "x", "1": "y", "2": "z"}.get(found[1], found[1])
+    return heading
 
 
-def _raise_bad_row(
-    path: Path, rows: list[tuple[int, str]], delimiter: str | None, places: Sequence[int], n_columns: int
-) -> NoReturn:
-    for number, text in rows:
-        cells = _split(text, delimiter)
-        if len(cells) != n_columns:
-            halves = f" {_POINT}" if delimiter == "," and len(cells) == 2 * n_columns else ""
-            raise MeshError(
-                f"{path.name}, line {number}: {len(cells)} columns, where the first row has {n_columns}.{halves}"
-            )
-        for place in places:
-            if not _is_number(cells[place]):
-                raise MeshError(f"{path.name}, line {number}: '{cells[place][:40]}' is not a number. {_POINT}")
-    raise MeshError(f"{path.name}: the numbers cannot be read. Write them in plain digits, such as -1.5e-3.")
+def _by_place(path: Path, table: Table) -> Contents:
+    if table.n_columns < 3:
+        raise MeshError(
+            f"{path.name}, line {table.line}: {table.n_columns} columns. A point needs at least x, y and z, and "
+            "columns in another order a first row of headings: x, y, z, nx, ny, nz, weight."
+        )
+    points = table.numbers(range(3))
+    others = {place: column for place in range(3, table.n_columns) if (column := _numbers(table, place)) is not None}
+    if table.delimiter == "," and table.n_columns == 6 and _are_halves(table):
+        raise MeshError(
+            f"{path.name}: 6 columns of whole numbers, the last three of them no normals: decimal commas, it seems. "
+            "Write decimals with a point, or name the columns in a first row."
+        )
+    for first in others:
+        places = range(first, first + 3)
+        if others.keys() >= set(places) and _are_normals(np.stack([others[place] for place in places], axis=1)):
+            normals = np.stack([others[place] for place in places], axis=1)
+            break
+    else:
+        places, normals = (), None
+    if left := [place for place in range(3, table.n_columns) if place not in places]:
+        taken = f"columns 1, 2, 3 were read as x, y, z{f', {name_columns(places)} as normals' if places else ''}"
+        warn(
+            path,
+            f"there are no headings: {taken}, and {name_columns(left)} left out. Unnamed columns are normals only "
+            "where their lengths are near 1. Name the columns in a first row where these are something else.",
+        )
+    return Contents(points, None, normals)
 
 
-def _split(text: str, delimiter: str | None) -> list[str]:
-    if delimiter is None:
-        return [cell.strip('"') for cell in text.split()]
+def _numbers(table: Table, place: int) -> Float[np.ndarray, "p"] | None:
     try:
-        return [cell.strip() for cell in next(csv.reader([text], delimiter=delimiter))]
-    except csv.Error:  # a cell of more than 100 kB
-        return [text]
+        return table.numbers([place])[:, 0]
+    except MeshError:  # text without a heading
+        return None
 
 
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return "_" not in cell  # Python's own way to write thousands
+def _are_normals(rows: Float[np.ndarray, "p 3"]) -> bool:
+    """Whether rows are unit normals, absent ones (zero or NaN) aside; colours are never negative."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        length = np.linalg.norm(rows, axis=1)
+        there = np.isfinite(length) & (length > 0)
+        return bool(there.any() and (np.abs(length[there] - 1) < _NEAR_ONE).all() and (rows[there] < 0).any())
+
+
+def _are_halves(table: Table) -> bool:
+    """Whether rows of six whole numbers are three that were cut at their decimal commas: 1,25 read as 1 and 25.
+
+    What follows such a comma has no sign. Few colours and no normals look so in all of the rows.
+    """
+    whole = all(re.fullmatch("[+-]?[0-9]+", cell) for row in table.rows for cell in row)
+    signed = whole and any(row[place][0] in "+-" for row in table.rows for place in (1, 3, 5))
+    return whole and not signed and any(int(cell[:9]) > 1 for row in table.rows for cell in row[3:])

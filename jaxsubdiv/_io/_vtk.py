@@ -1,32 +1,138 @@
-"""VTP files and legacy VTK files of polygons, by VTK through pyvista."""
+"""Legacy VTK files of polygons; and how VTK writes these and VTP files.
 
+Not read by VTK: counts that a file only announces end the interpreter there.
+"""
+
+import re
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
+from jaxtyping import Int, Shaped
 
-from ..errors import MeshError
-from ._contents import Contents, VertexData, by_size, check_polygons, doubles, library, warn
+from ..errors import MeshError, name_rows
+from ._contents import Contents, VertexData, by_size, check_polygons, doubles, library
+from ._text import parse_numbers
 
 _NORMALS = "Normals"
+_TYPES = {
+    **{"unsigned_char": "u1", "char": "i1", "unsigned_short": "u2", "short": "i2", "unsigned_int": "u4", "int": "i4"},
+    **{"unsigned_long": "u8", "long": "i8", "float": "f4", "double": "f8", "vtkidtype": "i4"},
+    **{f"vtktype{sign}int{8 * n}": f"{'u' if sign else 'i'}{n}" for sign in ("", "u") for n in (1, 2, 4, 8)},
+}
+_CELLS = ("vertices", "lines", "polygons", "triangle_strips")
+_VECTORS = {
+    "normals": 3,
+    "vectors": 3,
+    "tensors": 9,
+    "tensors6": 6,
+    "global_ids": 1,
+    "pedigree_ids": 1,
+    "edge_flags": 1,
+}
+_MOST_WORDS = 1000  # bytes of one line of words
+
+
+class _Cursor:
+    """Where reading stands in the file, and the ways to go on."""
+
+    def __init__(self, path: Path, data: bytes):
+        self.path, self.data, self.at, self.is_text = path, data, 0, True
+
+    def line(self) -> str:
+        """The rest of the line."""
+        end = self.data.find(b"\n", self.at)
+        end = len(self.data) if end < 0 else end
+        text, self.at = self.data[self.at : min(end, self.at + _MOST_WORDS)], end + 1
+        return text.decode("utf-8", errors="replace").strip()
+
+    def words(self) -> list[str]:
+        """The next line that is not blank, as words in small letters; none at the end of the file."""
+        while self.at < len(self.data):
+            if words := self.line().lower().split():
+                return words
+        return []
+
+    def next_begins(self, word: str) -> bool:
+        """Whether the next line that is not blank begins so."""
+        here = self.at
+        words, self.at = self.words(), here
+        return words[:1] == [word]
+
+    def numbers(self, n: int, kind: str) -> Shaped[np.ndarray, "n"]:
+        """The next `n` numbers of a type; the error where there are not so many says where they should begin."""
+        dtype = np.dtype(f">{_TYPES.get(kind) or self.refuse(f'the type {kind[:40]!r} is not read')}")
+        if not 0 <= n <= len(self.data) - self.at:
+            self.refuse(f"{n} numbers are announced, but {max(len(self.data) - self.at, 0)} bytes follow")
+        if self.is_text:
+            return self._text_numbers(n)
+        values = np.frombuffer(self.data, dtype, min(n, (len(self.data) - self.at) // dtype.itemsize), self.at)
+        if len(values) < n:
+            self.refuse(f"{n} numbers are announced, but the file ends after {len(values)}")
+        self.at += values.nbytes
+        return values.astype(dtype.newbyteorder("="))
+
+    def _text_numbers(self, n: int) -> Shaped[np.ndarray, "n"]:
+        words: list[bytes] = []
+        while len(words) < n:
+            # Numbers take a few bytes each; what was taken too many is put back.
+            found = list(re.finditer(rb"\S+", self.data[self.at : self.at + 8 * (n - len(words)) + 100]))
+            whole = found if self.at + 8 * (n - len(words)) + 100 >= len(self.data) else found[:-1]
+            taken = whole[: n - len(words)]
+            if not taken:
+                self.refuse(f"{n} numbers are announced, but the file ends after {len(words)}")
+            words += [match[0] for match in taken]
+            self.at += taken[-1].end()
+        values = parse_numbers(b" ".join(words).decode("ascii", errors="replace"))
+        if len(values) < n:
+            bad = next(word for word in words if len(parse_numbers(word.decode("ascii", errors="replace"))) != 1)
+            self.refuse(f"'{bad[:40].decode(errors='replace')}' is not a number")
+        return values
+
+    def skip(self, n_bytes: int) -> None:
+        """Leave bytes out."""
+        self.at += n_bytes
+
+    def count(self, words: list[str], place: int) -> int:
+        """The whole number at a place of a line of words."""
+        if len(words) <= place or not re.fullmatch("[0-9]{1,18}", words[place]):
+            self.refuse(f"'{' '.join(words)[:60]}' must have a whole number as word {place + 1}")
+        return int(words[place])
+
+    def refuse(self, what: str) -> NoReturn:
+        """Raise with the line, or the byte of a binary file."""
+        where = f"line {self.data.count(10, 0, self.at) + 1}" if self.is_text else f"byte {self.at}"
+        raise MeshError(f"{self.path.name}, {where}: {what}. The file is cut off or damaged: save it again.")
 
 
 def read(path: Path) -> Contents:
     """Points, polygons, and the point normals: the array marked as such, or the one called Normals."""
-    polydata = _read_polydata(path)
-    if polydata.n_strips:
+    contents, cells = _read(path)
+    strips, _ = cells.get("triangle_strips", ([], []))
+    if len(strips):
         raise MeshError(
-            f"{path.name}: it holds {polydata.n_strips} triangle strips, which are not read. Save it as polygons: "
+            f"{path.name}: it holds {len(strips)} triangle strips, which are not read. Save it as polygons: "
             "pyvista.read(...).triangulate().save(...)."
         )
-    arrays = polydata.point_data
-    names = [arrays.active_normals_name, *(name for name in arrays if name.lower() == "normals")]
-    normals = [arrays[name] for name in names if name is not None and arrays[name].shape == polydata.points.shape]
-    return Contents(
-        doubles(np.asarray(polydata.points)),
-        _faces(path, polydata),
-        doubles(np.asarray(normals[0])) if normals else None,
-    )
+    return contents._replace(faces=polygons(path, *cells["polygons"]) if "polygons" in cells else None)
+
+
+def read_points(path: Path) -> Contents:
+    """Points and their normals, whatever cells they have."""
+    return _read(path)[0]
+
+
+def polygons(
+    path: Path, ends: Int[np.ndarray, "f"], corners: Int[np.ndarray, "c"]
+) -> dict[int, Int[np.ndarray, "_ _"]] | None:
+    """Faces whose corners end at `ends`; None where there are none."""
+    if len(ends) == 0:
+        return None
+    sizes = np.diff(ends, prepend=0)
+    check_polygons(path, sizes)
+    if ends[-1] > len(corners):
+        raise MeshError(f"{path.name}: the faces need {ends[-1]} corners, but there are {len(corners)}. It is damaged.")
+    return by_size(corners, ends - sizes, sizes)
 
 
 def write(path: Path, contents: Contents, data: VertexData) -> None:
@@ -53,41 +159,121 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
         raise OSError(f"{path.name}: VTK could not write the file: {messages or 'it gives no reason'}")
 
 
-def _read_polydata(path: Path) -> Any:
-    pyvista = library("pyvista", ".vtp and .vtk files")
-    if path.suffix.lower() == ".vtp":
-        reader = library("vtkmodules.vtkIOXML", ".vtp files").vtkXMLPolyDataReader()
-    else:
-        reader = library("vtkmodules.vtkIOLegacy", ".vtk files").vtkDataSetReader()
-    reader.SetFileName(str(path))
-    _, messages = _watch(reader.Update)
-    # VTK calls a file that ends too early a warning, and fills up what is missing.
-    if "error" in messages.lower() or reader.GetOutput() is None:
+def _read(path: Path) -> tuple[Contents, dict[str, tuple[Int[np.ndarray, "f"], Int[np.ndarray, "c"]]]]:
+    """Points with their normals; and by the kind of the cells where the corners of each end, and the corners."""
+    cursor = _Cursor(path, path.read_bytes())
+    if not cursor.line().lower().startswith("# vtk datafile version"):
         raise MeshError(
-            f"{path.name}: VTK cannot read the file, it is damaged or of another format. It says: {messages}"
+            f"{path.name}, line 1: a legacy VTK file begins with '# vtk DataFile Version'; this one does not."
         )
-    if messages:
-        warn(path, f"VTK says: {messages}")
-    dataset = pyvista.wrap(reader.GetOutput())
-    if not isinstance(dataset, pyvista.PolyData):
-        raise MeshError(
-            f"{path.name}: it holds a {type(dataset).__name__}, not polygons. Take its surface first: "
-            "pyvista.read(...).extract_surface().save(...)."
-        )
-    return dataset
+    cursor.line()  # the title, which may be blank
+    kind = cursor.words()
+    if kind not in (["ascii"], ["binary"]):
+        cursor.refuse("the third line must be ASCII or BINARY")
+    cursor.is_text = kind == ["ascii"]
+    points, normals, cells, of_points = None, {}, {}, False
+    n_tuples = 0
+    while words := cursor.words():
+        match words[0]:
+            case "dataset":
+                if words[1:] != ["polydata"]:
+                    raise MeshError(
+                        f"{path.name}: it holds a {' '.join(words[1:])[:40].upper()}, not polygons. Take its surface "
+                        "first: pyvista.read(...).extract_surface().save(...)."
+                    )
+            case "points":
+                points = cursor.numbers(3 * cursor.count(words, 1), words[-1]).reshape(-1, 3)
+            case name if name in _CELLS:
+                cells[name] = _read_cells(cursor, words)
+            case "cell_data" | "point_data":
+                n_tuples, of_points = cursor.count(words, 1), words[0] == "point_data"
+            case "metadata":
+                while cursor.at < len(cursor.data) and cursor.line():
+                    pass
+            case _:
+                found = _read_attribute(cursor, words, n_tuples)
+                if found is None:
+                    break  # how long the rest is nobody knows; only attributes come this late
+                normals |= found if of_points else {}
+    if points is None:
+        raise MeshError(f"{path.name}: it has no POINTS. It is cut off, or no POLYDATA file.")
+    fitting = [rows for _, rows in sorted(normals.items()) if rows.shape == points.shape]
+    return Contents(doubles(points), None, doubles(fitting[0]) if fitting else None), cells
 
 
-def _faces(path: Path, polydata: Any) -> dict[int, np.ndarray] | None:
-    to_numpy = library("vtkmodules.util.numpy_support", ".vtp and .vtk files").vtk_to_numpy
-    polygons = polydata.GetPolys()
-    if polygons.GetNumberOfCells() == 0:
-        return None
-    offsets, corners = (
-        to_numpy(array).astype(np.int64) for array in (polygons.GetOffsetsArray(), polygons.GetConnectivityArray())
-    )
-    sizes = np.diff(offsets)
-    check_polygons(path, sizes)
-    return by_size(corners, offsets[:-1], sizes)
+def _read_cells(cursor: _Cursor, words: list[str]) -> tuple[Int[np.ndarray, "f"], Int[np.ndarray, "c"]]:
+    n, size = cursor.count(words, 1), cursor.count(words, 2)
+    if cursor.next_begins("offsets"):  # since version 5.1: one offset more than there are cells
+        offsets = _whole(cursor, cursor.numbers(n, cursor.words()[-1]))
+        if not cursor.next_begins("connectivity"):
+            cursor.refuse("CONNECTIVITY must follow OFFSETS")
+        corners = _whole(cursor, cursor.numbers(size, cursor.words()[-1]))
+        return offsets[1:], corners
+    values, ends, at = _whole(cursor, cursor.numbers(size, "int")), np.zeros(min(n, size), int), 0
+    is_corner = np.ones(size, bool)
+    for i in range(n):
+        if at >= size or values[at] < 0:
+            cursor.refuse(f"{n} cells are announced, but the {size} numbers hold {i}")
+        is_corner[at] = False
+        at += 1 + int(values[at])
+        ends[i] = at - i - 1
+    return ends, values[is_corner]
+
+
+def _read_attribute(cursor: _Cursor, words: list[str], n: int) -> dict[int, np.ndarray] | None:
+    """Rows that may be the normals of points, the surest with the smallest key; None where it is not known."""
+    match words:
+        case ["normals", *_]:
+            return {0: cursor.numbers(3 * n, words[-1]).reshape(-1, 3)}
+        case [kind, name, type_] if kind in _VECTORS:
+            return _named(name, cursor.numbers(_VECTORS[kind] * n, type_), _VECTORS[kind])
+        case ["scalars", name, type_, *width]:
+            n_columns = cursor.count(width, 0) if width else 1
+            if cursor.next_begins("lookup_table"):
+                cursor.words()
+            return _named(name, cursor.numbers(n_columns * n, type_), n_columns)
+        case ["color_scalars", _, width]:
+            cursor.numbers(cursor.count([width], 0) * n, "unsigned_char")
+        case ["lookup_table", _, size]:
+            cursor.numbers(4 * cursor.count([size], 0), "unsigned_char")
+        case ["texture_coordinates", _, width, type_]:
+            cursor.numbers(cursor.count([width], 0) * n, type_)
+        case ["field", _, n_arrays]:
+            return _read_field(cursor, cursor.count([n_arrays], 0))
+        case _:
+            return None
+    return {}
+
+
+def _read_field(cursor: _Cursor, n_arrays: int) -> dict[int, np.ndarray] | None:
+    found = {}
+    for _ in range(n_arrays):
+        while (words := cursor.words()) and words[0] == "metadata":
+            while cursor.at < len(cursor.data) and cursor.line():
+                pass
+        if not words:
+            return found
+        n_columns, n = cursor.count(words, 1), cursor.count(words, 2)
+        if words[-1] == "string" and cursor.is_text:
+            for _ in range(min(n_columns * n, len(cursor.data))):
+                cursor.line()
+        elif words[-1] not in _TYPES:
+            return None
+        else:
+            found |= _named(words[0], cursor.numbers(n_columns * n, words[-1]), n_columns)
+    return found
+
+
+def _named(name: str, values: np.ndarray, n_columns: int) -> dict[int, np.ndarray]:
+    return {1: values.reshape(-1, 3)} if name == _NORMALS.lower() and n_columns == 3 else {}
+
+
+def _whole(cursor: _Cursor, values: Shaped[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+    with np.errstate(invalid="ignore"):
+        indices = values.astype(np.int64)
+    if (wrong := np.flatnonzero(indices != values)).size:
+        cursor.refuse(f"cells hold what is no whole number at their places {name_rows(wrong)}")
+    return indices
 
 
 def _watch(act: Any) -> tuple[Any, str]:

@@ -1,0 +1,193 @@
+"""VTP files: VTK's polygons as XML. VTK writes them, see `_vtk`.
+
+Not read by VTK: counts that a file only announces end the interpreter there.
+"""
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from jaxtyping import Int, Shaped
+
+from ..errors import MeshError
+from . import _xml
+from ._contents import Contents, doubles, whole
+from ._text import parse_rows
+from ._vtk import polygons
+
+_TYPES = {
+    **{f"{sign}Int{8 * n}": f"{'u' if sign else 'i'}{n}" for sign in ("", "U") for n in (1, 2, 4, 8)},
+    "Float32": "f4",
+    "Float64": "f8",
+}
+_APPENDED = re.compile(rb"<AppendedData[^>]*>\s*_")
+_PACKERS = {None: None, "vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
+
+
+class _File(NamedTuple):
+    path: Path
+    root: Element
+    appended: bytes
+    """What follows the underscore of the appended data."""
+    is_raw: bool
+    """Whether the appended data are bytes, not base64."""
+
+
+def read(path: Path) -> Contents:
+    """Points, polygons, and the point normals: the array marked as such, or the one called Normals."""
+    file = _open(path)
+    contents, faces, n_before = [], [], 0
+    for piece in _pieces(file):
+        if _count(file, piece, "NumberOfStrips"):
+            raise MeshError(
+                f"{path.name}: it holds {piece.get('NumberOfStrips')} triangle strips, which are not read. Save it as "
+                "polygons: pyvista.read(...).triangulate().save(...)."
+            )
+        contents.append(_points(file, piece))
+        blocks = _polygons(file, piece, _count(file, piece, "NumberOfPolys"))
+        faces += [{size: block + n_before for size, block in blocks.items()}] if blocks else []
+        n_before += len(contents[-1].vertices)
+    joined = {size: np.concatenate([blocks[size] for blocks in faces]) for size in (3, 4)} if faces else None
+    return _join(contents)._replace(faces=joined)
+
+
+def read_points(path: Path) -> Contents:
+    """Points and their normals, whatever cells they have."""
+    file = _open(path)
+    return _join([_points(file, piece) for piece in _pieces(file)])
+
+
+def _open(path: Path) -> _File:
+    data, appended, is_raw = path.read_bytes(), b"", False
+    if found := _APPENDED.search(data):  # raw bytes are no XML
+        appended, is_raw = data[found.end() :], b'"raw"' in found[0]
+        data = data[: found.start()] + b"</VTKFile>"
+        appended = appended[: max(appended.rfind(b"</AppendedData"), 0) or None]
+    root = _xml.parse(path, data, "VTKFile")
+    if root.get("type") != "PolyData":
+        raise MeshError(
+            f"{path.name}: it holds a {str(root.get('type'))[:40]}, not polygons. Take its surface first: "
+            "pyvista.read(...).extract_surface().save(...)."
+        )
+    return _File(path, root, appended, is_raw)
+
+
+def _pieces(file: _File) -> list[Element]:
+    pieces = file.root.findall("PolyData/Piece")
+    if not pieces:
+        raise MeshError(f"{file.path.name}: it has no element 'Piece', so no points. It is damaged.")
+    return pieces
+
+
+def _points(file: _File, piece: Element) -> Contents:
+    n = _count(file, piece, "NumberOfPoints")
+    array = piece.find("Points/DataArray")
+    if array is None:
+        if n:
+            raise MeshError(f"{file.path.name}: {n} points are announced, but the element 'Points' has no array.")
+        return Contents(np.zeros((0, 3)))
+    points = _array(file, array, 3 * n).reshape(-1, 3)
+    data = piece.find("PointData")
+    if data is None:
+        return Contents(doubles(points))
+    arrays = [array for array in data.findall("DataArray") if array.get("NumberOfComponents") == "3"]
+    marked = [array for array in arrays if array.get("Name") == data.get("Normals")]
+    marked += [array for array in arrays if (array.get("Name") or "").lower() == "normals"]
+    return Contents(doubles(points), None, doubles(_array(file, marked[0], 3 * n).reshape(-1, 3)) if marked else None)
+
+
+def _polygons(file: _File, piece: Element, n: int) -> dict[int, Int[np.ndarray, "_ _"]] | None:
+    arrays = {array.get("Name"): array for array in piece.findall("Polys/DataArray")}
+    if not n:
+        return None
+    if not {"offsets", "connectivity"} <= arrays.keys():
+        raise MeshError(f"{file.path.name}: the element 'Polys' needs the arrays 'connectivity' and 'offsets'.")
+    ends = whole(file.path, _array(file, arrays["offsets"], n))
+    return polygons(file.path, ends, whole(file.path, _array(file, arrays["connectivity"], max(int(ends[-1]), 0))))
+
+
+def _join(parts: list[Contents]) -> Contents:
+    """The pieces as one; normals only where all have some."""
+    normals = [part.normals for part in parts if part.normals is not None]
+    vertices = np.concatenate([part.vertices for part in parts])
+    return Contents(vertices, None, np.concatenate(normals) if len(normals) == len(parts) else None)
+
+
+def _count(file: _File, piece: Element, name: str) -> int:
+    text = piece.get(name, "0").strip()
+    if not re.fullmatch("[0-9]{1,18}", text):
+        raise MeshError(f"{file.path.name}: '{name}' is '{text[:40]}', which is no count. The file is damaged.")
+    return int(text)
+
+
+def _array(file: _File, array: Element, n: int) -> Shaped[np.ndarray, "n"]:
+    """The `n` numbers of a data array."""
+    name = array.get("Name", "without a name")[:40]
+    try:
+        kind, form = _TYPES.get(array.get("type", "")), array.get("format")
+        if kind is None:
+            raise ValueError(f"the type '{array.get('type')}' is not read")
+        if form == "ascii":
+            # Not more numbers than announced are an error too: text in the array's elements comes after them.
+            values = parse_rows(file.path, array.text or "").values
+        elif form in ("binary", "appended"):
+            order = ">" if file.root.get("byte_order") == "BigEndian" else "<"
+            values = np.frombuffer(_bytes(file, array, form), np.dtype(order + kind))
+        else:
+            raise ValueError(f"the format '{form}' is not known")
+        if len(values) != n:
+            raise ValueError(f"{n} numbers are announced, but there are {len(values)}")
+    except ValueError as error:
+        text = str(error).removeprefix(f"{file.path.name}, ")
+        raise MeshError(f"{file.path.name}: the array '{name}': {text}. The file is cut off or damaged.") from None
+    return values
+
+
+def _bytes(file: _File, array: Element, form: str) -> bytes:
+    """What a data array holds, unpacked."""
+    packer = file.root.get("compressor")
+    if packer not in _PACKERS:
+        raise ValueError(f"it is packed by {packer}. Save it with zlib, by VTK's SetCompressorTypeToZLib")
+    if form == "appended":
+        offset = array.get("offset", "")
+        if not re.fullmatch("[0-9]{1,18}", offset) or int(offset) > len(file.appended):
+            raise ValueError(f"the offset '{offset[:40]}' lies outside of the appended data")
+        data = file.appended[int(offset) :]
+        if not file.is_raw:
+            data = _xml.from_base64(data[: _end(file, int(offset)) - int(offset)].decode("ascii", errors="replace"))
+    else:
+        data = _xml.from_base64(array.text or "")
+    header = np.dtype(
+        (">" if file.root.get("byte_order") == "BigEndian" else "<")
+        + {"UInt64": "u8"}.get(file.root.get("header_type", ""), "u4")
+    )
+    if _PACKERS[packer] is None:
+        n_bytes = _counts(data, header, 0, 1)[0]
+        found = data[header.itemsize : header.itemsize + n_bytes]
+        if len(found) < n_bytes:
+            raise ValueError(f"{n_bytes} bytes are announced, but {len(found)} are there")
+        return found
+    n_blocks, block, last = _counts(data, header, 0, 3)
+    sizes, at, blocks = _counts(data, header, 3, n_blocks), (3 + n_blocks) * header.itemsize, []
+    for i, size in enumerate(sizes):
+        n_bytes = last if last and i == n_blocks - 1 else block
+        blocks.append(_xml.unpack(data[at : at + size], n_bytes, str(_PACKERS[packer])))
+        at += size
+    return b"".join(blocks)
+
+
+def _end(file: _File, offset: int) -> int:
+    """Where the next array of the appended data begins, which is where this one ends in base64."""
+    offsets = [array.get("offset", "") for array in file.root.iter("DataArray")]
+    return min(
+        (int(o) for o in offsets if re.fullmatch("[0-9]{1,18}", o) and int(o) > offset), default=len(file.appended)
+    )
+
+
+def _counts(data: bytes, header: np.dtype, first: int, n: int) -> list[int]:
+    """Whole numbers of the header before the data."""
+    if (first + n) * header.itemsize > len(data):
+        raise ValueError("it ends before its own header does")
+    return np.frombuffer(data, header, n, first * header.itemsize).tolist()

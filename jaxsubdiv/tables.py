@@ -1,0 +1,223 @@
+"""Tables of text: records that Python's `csv` parses, with or without a row of headings."""
+
+import csv
+import re
+from collections.abc import Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from .errors import MeshError, name_rows
+
+_DELIMITERS = (";", "\t", ",", " ")  # a blank stands for any white space
+_HEADING = 10_000  # characters of a heading at most
+_SAMPLE = 20  # records from which the delimiter is found
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?(inf|infinity|nan)", re.ASCII | re.IGNORECASE)
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
+_MISSING = {"", "-", "na", "n/a", "null", "none", "-nan(ind)", "nan(ind)", "1.#qnan", "-1.#ind", "1.#inf", "-1.#inf"}
+_UNIT = re.compile(r"\s*[(\[][^)\]]*[)\]]")
+_COMMENTS = ("#", "//")
+_POINT = "Write decimals with a point."
+
+
+class Table(NamedTuple):
+    """The records of a file, all with as many cells."""
+
+    name: str
+    """Of the file, for error texts."""
+    headings: list[str]
+    """Without units, in small letters; none where the file has no row of headings."""
+    line: int
+    """Where the headings stand, or the first record."""
+    rows: list[list[str]]
+    lines: list[int]
+    """The line of the file on which each row begins."""
+    delimiter: str
+
+    @property
+    def n_columns(self) -> int:
+        """Cells of every row."""
+        return len(self.headings or self.rows[0])
+
+    def texts(self, place: int) -> list[str]:
+        """One column as it stands."""
+        return [row[place] for row in self.rows]
+
+    def numbers(self, places: Sequence[int]) -> Float[np.ndarray, "r c"]:
+        """Columns of numbers; a cell that is empty, or says that there is none, is NaN.
+
+        Raises:
+            MeshError: a cell is no number; the text names the line.
+        """
+        columns = [self._column(place) for place in places]
+        return np.stack(columns, axis=1) if columns else np.zeros((len(self.rows), 0))
+
+    def _column(self, place: int) -> Float[np.ndarray, "r"]:
+        cells = self.texts(place)
+        text = "".join(cells)
+        try:
+            if text.isascii() and "_" not in text:  # Python takes digits of any script, and its own way of thousands
+                return np.fromiter(map(float, cells), np.float64, len(cells))
+        except ValueError:
+            pass
+        if self.delimiter != "," and "," in text and "." in text:
+            line = next(line for cell, line in zip(cells, self.lines, strict=True) if "," in cell)
+            raise MeshError(
+                f"{self.name}, line {line}: the column has both commas and points. {_POINT} Leave out what parts "
+                "thousands."
+            )
+        return np.array([self._number(cell, line) for cell, line in zip(cells, self.lines, strict=True)], np.float64)
+
+    def _number(self, cell: str, line: int) -> float:
+        if _NUMBER.fullmatch(cell):
+            return float(cell)
+        if cell.lower() in _MISSING:
+            return np.nan
+        if self.delimiter != "," and _DECIMAL_COMMA.fullmatch(cell):
+            return float(cell.replace(",", "."))
+        raise MeshError(f"{self.name}, line {line}: '{cell[:40]}' is not a number. {_POINT}")
+
+
+def decode(data: bytes) -> str:
+    """Text with any line ends; bytes that are not UTF-8 become replacement characters, since only names have any."""
+    encoding = "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"  # spreadsheets write both
+    text = data.decode(encoding, errors="replace").removeprefix("\ufeff")
+    return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+
+
+def read_table(path: Path) -> Table:
+    """The table of a file of text.
+
+    Semicolons, tabs, commas or white space part the cells; which of them, the first records tell. A cell in quotes may
+    hold any of these, line ends and `#`. What follows a `#` is a comment, unless it stands right after a comma or a
+    semicolon, and so are lines that begin with `//` or `;`. Decimals may be written with a comma where it does not part
+    the cells. A first row of one whole number is the count of the others. The first row holds headings where fewer than
+    three of its cells are numbers; a comment right before the numbers holds them where it names x, y and z.
+
+    Raises:
+        MeshError: the file holds no such table; the text names it and the line.
+    """
+    text = decode(path.read_bytes())
+    delimiter = _find_delimiter(path, text)
+    records = list(_records(path, text, delimiter))
+    count = _leading_count(records)
+    records = records[count is not None :]
+    if not records:
+        raise MeshError(f"{path.name}: it has no line of numbers.")
+    line, first = records[0]
+    headings = [] if _n_numbers(first, delimiter) >= min(3, len(first)) else _headings(first)
+    if headings:
+        records = records[1:]
+    else:
+        headings = _commented_headings(text, line, delimiter, len(first))
+    if headings and records and delimiter == " " and len(headings) != len(records[0][1]):
+        headings = _headings(_UNIT.sub("", " ".join(first)).split())
+    rows, lines = [cells for _, cells in records], [number for number, _ in records]
+    _check_columns(path, rows, lines, len(headings or first), delimiter)
+    if count is not None and count != len(rows):
+        raise MeshError(
+            f"{path.name}: the first row announces {count} rows, but {len(rows)} follow. The file is cut off, or the "
+            "count is wrong: correct or delete it."
+        )
+    return Table(path.name, headings, line, rows, lines, delimiter)
+
+
+def _records(path: Path, text: str, delimiter: str) -> Iterator[tuple[int, list[str]]]:
+    """Records that hold something, each with the line on which it begins."""
+    inside = False  # a record: then the line goes on with a cell in quotes, and holds no comment
+
+    def lines() -> Iterator[str]:
+        nonlocal inside
+        for line in text.split("\n"):
+            goes_on, inside = inside, True  # until the record ends, and the loop below says so
+            yield (line if goes_on else _without_comment(line, delimiter)) + "\n"
+
+    parser = csv.reader(lines(), delimiter=delimiter, skipinitialspace=True, strict=True)
+    while True:
+        inside, begin = False, parser.line_num + 1
+        try:
+            cells = [cell.strip() for cell in next(parser)]
+        except StopIteration:
+            return
+        except csv.Error as error:
+            raise MeshError(
+                f"{path.name}, line {begin}: the row cannot be parsed ({error}). Close its quotes, and put nothing "
+                "between them and the next column."
+            ) from None
+        if delimiter == " " and cells and not cells[-1]:
+            cells.pop()  # of white space at the end
+        if any(cells):
+            yield begin, cells
+
+
+def _without_comment(line: str, delimiter: str) -> str:
+    begin = line.lstrip()
+    # With semicolons an empty first cell begins a line as such a comment does.
+    if begin.startswith(_COMMENTS) or (begin[:1] == ";" and (delimiter != ";" or begin[1:2].isspace())):
+        return ""
+    if "#" in line:
+        at = -1
+        while (at := line.find("#", at + 1)) >= 0:
+            if line.count('"', 0, at) % 2 == 0 and line[at - 1] not in ",;":
+                line = line[:at]
+                break
+    return line.replace("\t", " ") if delimiter == " " else line
+
+
+def _find_delimiter(path: Path, text: str) -> str:
+    """The first of the delimiters that parts the first records alike, with three numbers in each."""
+    for delimiter in _DELIMITERS:
+        try:
+            records = list(islice(_records(path, text, delimiter), _SAMPLE))
+        except MeshError:
+            continue
+        body = records[_leading_count(records) is not None :]
+        if body and _n_numbers(body[0][1], delimiter) < 3:
+            heading = _UNIT.sub("", " ".join(body[0][1])).split() if delimiter == " " else body[0][1]
+            body = [(0, heading), *body[1:]] if len(body) > 1 and len(body[1][1]) != len(body[0][1]) else body
+        if len({len(cells) for _, cells in body}) == 1 and _n_numbers(body[-1][1], delimiter) >= 3:
+            return delimiter
+    # None does: the one that stands in the first row shows best what is wrong with the others.
+    first = next((line for line in text.split("\n") if _without_comment(line, " ").strip()), "")
+    return next((delimiter for delimiter in _DELIMITERS if delimiter in first.strip()), " ")
+
+
+def _leading_count(records: list[tuple[int, list[str]]]) -> int | None:
+    if len(records) < 2 or len(records[1][1]) < 3:
+        return None
+    cells = [cell for cell in records[0][1] if cell]
+    return int(cells[0]) if len(cells) == 1 and re.fullmatch("[0-9]{1,18}", cells[0]) else None
+
+
+def _n_numbers(cells: list[str], delimiter: str) -> int:
+    return sum(bool(_NUMBER.fullmatch(cell) or (delimiter != "," and _DECIMAL_COMMA.fullmatch(cell))) for cell in cells)
+
+
+def _headings(cells: list[str]) -> list[str]:
+    return [_UNIT.sub("", cell).strip().lower() or cell.lower() for cell in cells]
+
+
+def _commented_headings(text: str, line: int, delimiter: str, n_columns: int) -> list[str]:
+    """Headings in the comment right before the first record, where it names x, y and z and all other columns."""
+    before = text.split("\n", line)[line - 2] if line > 1 else ""
+    words = before[:_HEADING].strip().lstrip("#/; \t")
+    words = words.replace("\t", " ") if delimiter == " " else words
+    cells = _headings(next(csv.reader([words], delimiter=delimiter, skipinitialspace=True), []))
+    return cells if len(cells) == n_columns and {"x", "y", "z"} <= set(cells) else []
+
+
+def _check_columns(path: Path, rows: list[list[str]], lines: list[int], n_columns: int, delimiter: str) -> None:
+    for cells, line in zip(rows, lines, strict=True):
+        if len(cells) != n_columns:
+            halves = f" {_POINT}" if delimiter == "," and len(cells) == 2 * n_columns else ""
+            raise MeshError(
+                f"{path.name}, line {line}: {len(cells)} columns, where the first row has {n_columns}.{halves}"
+            )
+
+
+def name_columns(places: Sequence[int]) -> str:
+    """`column 4` or `columns 4, 5, 6`, counted from one."""
+    return f"column{'s' * (len(places) > 1)} {name_rows((place + 1 for place in places), 8)}"
