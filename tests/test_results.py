@@ -380,9 +380,12 @@ def test_coordinates_out_of_range_are_refused(factor, control):
 @pytest.mark.parametrize("length", [1e-200, 1e200])
 def test_only_directions_of_normals_count(length):
     p, normals = problem(), problem().points
-    with jax.enable_x64(False):
+    jax.config.update("jax_enable_x64", False)
+    try:
         scan, mesh = fitting.Scan(p.points, normals * length), js.ControlMesh(p.mesh.vertices, p.mesh.faces)
         again = js.ControlMesh(mesh.vertices, mesh.faces, mesh.vertices * length).control()
+    finally:
+        jax.config.update("jax_enable_x64", True)
     for found, given in ((scan.normals, normals), (again.normals, mesh.vertices)):
         found, given = (np.float64(rows) for rows in (found, given))
         given = given / np.linalg.norm(given, axis=1, keepdims=True)

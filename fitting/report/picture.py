@@ -45,7 +45,7 @@ def draw_fit(result: FitResult, start: js.ControlMesh, *, title: str = "") -> "F
 
         def draw(self, renderer: Any) -> None:
             with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", "Glyph .* missing from font")  # names are in all scripts
+                warnings.filterwarnings("ignore", "Glyph .* missing from")  # names are in all scripts
                 super().draw(renderer)
 
         def _repr_png_(self) -> bytes:
