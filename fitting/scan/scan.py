@@ -1,6 +1,7 @@
 """The scan: measured points, and what is known of each."""
 
 import re
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -155,7 +156,7 @@ class Scan(eqx.Module):
 def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[str] = ()) -> Scan:
     """A scan from a file of points: PLY, XYZ, CSV, TXT, NPZ, VTP, or any mesh file, whose vertices are then the points.
 
-    A column `slice` of a CSV file, or another table with a header row, numbers the slices. Points that are not finite
+    Faces of a mesh file are kept, see `Scan.faces`. A column `slice` of a CSV file, or another table with a header row, numbers the slices. Points that are not finite
     are dropped, with a warning; see `jaxsubdiv.read_points` for all that a file may hold.
 
     Args:
@@ -173,7 +174,7 @@ def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[st
     slices = None if _SLICE not in columns else _numbers(path, columns[_SLICE])
     words = [labels] if isinstance(labels, str) else list(labels)
     if not words:
-        return _scan(path, *cloud, None, slices)
+        return _scan(path, *cloud, None, slices, _faces_between(path, cloud.points, scale))
     of_rows = next((columns[name] for name in _LABELS if name in columns), [])
     chosen = np.array([any(word.casefold() in one.casefold() for word in words) for one in of_rows], bool)
     if not chosen.any():
@@ -190,6 +191,20 @@ def _scan(path: Path, *parts: np.ndarray | None) -> Scan:
             return Scan(*parts)
     except ScanError as error:
         raise ScanError(f"{path.name}: {error}") from None
+
+
+def _faces_between(path: Path, points: Float[np.ndarray, "p 3"], scale: float) -> Int[np.ndarray, "t 3"] | None:
+    """Triangles of a mesh file whose vertices are the points, quads cut in two; None where they cannot be had."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the points have been read: what there is to tell was told
+            mesh = js.read_mesh(path, scale=scale, check=False)
+    except (js.MeshError, ImportError):
+        return None
+    if not np.array_equal(mesh.vertices, points):
+        return None
+    quads = mesh.faces[4]
+    return np.concatenate([mesh.faces[3], quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
 def _numbers(path: Path, texts: list[str]) -> Int[np.ndarray, "p"]:
