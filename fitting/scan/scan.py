@@ -156,8 +156,9 @@ class Scan(eqx.Module):
 def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[str] = ()) -> Scan:
     """A scan from a file of points: PLY, XYZ, CSV, TXT, NPZ, VTP, or any mesh file, whose vertices are then the points.
 
-    Faces of a mesh file are kept, see `Scan.faces`. A column `slice` of a CSV file, or another table with a header row, numbers the slices. Points that are not finite
-    are dropped, with a warning; see `jaxsubdiv.read_points` for all that a file may hold.
+    Faces of a mesh file are kept, see `Scan.faces`. A column `slice` of a CSV file, or another table with a header row,
+    numbers the slices. Points that are not finite are dropped, with a warning; see `jaxsubdiv.read_points` for all that
+    a file may hold.
 
     Args:
         path: the file.
