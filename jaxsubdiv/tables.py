@@ -149,7 +149,7 @@ def _records(path: Path, text: str, delimiter: str) -> Iterator[tuple[int, list[
             ) from None
         if delimiter == " " and cells and not cells[-1]:
             cells.pop()  # of white space at the end
-        if any(cells):
+        if any(cells) or len(cells) > 1:  # where delimiters stand alone, a row has no numbers
             yield begin, cells
 
 
