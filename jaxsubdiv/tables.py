@@ -43,8 +43,8 @@ class Table(NamedTuple):
         return len(self.headings or self.rows[0])
 
     def texts(self, place: int) -> list[str]:
-        """One column as it stands."""
-        return [row[place] for row in self.rows]
+        """One column, without the white space around its cells."""
+        return [row[place].strip() for row in self.rows]
 
     def numbers(self, places: Sequence[int]) -> Float[np.ndarray, "r c"]:
         """Columns of numbers; a cell that is empty, or says that there is none, is NaN.
@@ -56,7 +56,7 @@ class Table(NamedTuple):
         return np.stack(columns, axis=1) if columns else np.zeros((len(self.rows), 0))
 
     def _column(self, place: int) -> Float[np.ndarray, "r"]:
-        cells = self.texts(place)
+        cells = [row[place] for row in self.rows]
         text = "".join(cells)
         try:
             if text.isascii() and "_" not in text:  # Python takes digits of any script, and its own way of thousands
@@ -72,6 +72,7 @@ class Table(NamedTuple):
         return np.array([self._number(cell, line) for cell, line in zip(cells, self.lines, strict=True)], np.float64)
 
     def _number(self, cell: str, line: int) -> float:
+        cell = cell.strip()
         if _NUMBER.fullmatch(cell):
             return float(cell)
         if cell.lower() in _MISSING:
@@ -135,22 +136,23 @@ def _records(path: Path, text: str, delimiter: str) -> Iterator[tuple[int, list[
             goes_on, inside = inside, True  # until the record ends, and the loop below says so
             yield (line if goes_on else _without_comment(line, delimiter)) + "\n"
 
-    parser = csv.reader(lines(), delimiter=delimiter, skipinitialspace=True, strict=True)
-    while True:
-        inside, begin = False, parser.line_num + 1
-        try:
-            cells = [cell.strip() for cell in next(parser)]
-        except StopIteration:
-            return
-        except csv.Error as error:
-            raise MeshError(
-                f"{path.name}, line {begin}: the row cannot be parsed ({error}). Close its quotes, and put nothing "
-                "between them and the next column."
-            ) from None
-        if delimiter == " " and cells and not cells[-1]:
-            cells.pop()  # of white space at the end
-        if any(cells):
-            yield begin, cells
+    # Most files have neither comments nor quotes, and go through the parser as they are, which is twice as fast.
+    plain = not any(mark in text for mark in ('"', "#", "//", *(";" if delimiter != ";" else ("\n;", "; "))))
+    given = iter((text.replace("\t", " ") if delimiter == " " else text).split("\n")) if plain else lines()
+    parser = csv.reader(given, delimiter=delimiter, skipinitialspace=True, strict=True)
+    begin = 1
+    try:
+        for cells in parser:
+            if delimiter == " " and cells and not cells[-1]:
+                cells.pop()  # of white space at the end
+            if len(cells) > 1 or any(cells):  # where delimiters stand alone, a row has no numbers
+                yield begin, cells
+            inside, begin = False, parser.line_num + 1
+    except csv.Error as error:
+        raise MeshError(
+            f"{path.name}, line {begin}: the row cannot be parsed ({error}). Close its quotes, and put nothing between "
+            "them and the next column."
+        ) from None
 
 
 def _without_comment(line: str, delimiter: str) -> str:
@@ -188,7 +190,7 @@ def _find_delimiter(path: Path, text: str) -> str:
 def _leading_count(records: list[tuple[int, list[str]]]) -> int | None:
     if len(records) < 2 or len(records[1][1]) < 3:
         return None
-    cells = [cell for cell in records[0][1] if cell]
+    cells = [cell.strip() for cell in records[0][1] if cell.strip()]
     return int(cells[0]) if len(cells) == 1 and re.fullmatch("[0-9]{1,18}", cells[0]) else None
 
 
@@ -197,7 +199,7 @@ def _n_numbers(cells: list[str], delimiter: str) -> int:
 
 
 def _headings(cells: list[str]) -> list[str]:
-    return [_UNIT.sub("", cell).strip().lower() or cell.lower() for cell in cells]
+    return [_UNIT.sub("", cell).strip().lower() or cell.strip().lower() for cell in cells]
 
 
 def _commented_headings(text: str, line: int, delimiter: str, n_columns: int) -> list[str]:
@@ -210,6 +212,8 @@ def _commented_headings(text: str, line: int, delimiter: str, n_columns: int) ->
 
 
 def _check_columns(path: Path, rows: list[list[str]], lines: list[int], n_columns: int, delimiter: str) -> None:
+    if set(map(len, rows)) <= {n_columns}:
+        return
     for cells, line in zip(rows, lines, strict=True):
         if len(cells) != n_columns:
             halves = f" {_POINT}" if delimiter == "," and len(cells) == 2 * n_columns else ""

@@ -421,14 +421,14 @@ def test_vtk_normals_under_another_name_and_ascii(tmp_path):
 def test_vtk_that_is_damaged_or_something_else(tmp_path, suffix, capfd):
     import pyvista
 
-    with pytest.raises(MeshError, match=rf"a\{suffix}: VTK cannot read the file, it is damaged or of another format"):
+    with pytest.raises(MeshError, match=rf"a\{suffix}.*(cannot be read as XML|begins with '# vtk DataFile Version')"):
         read_mesh(put(tmp_path, f"a{suffix}", "hello"))
     write_mesh(tmp_path / f"b{suffix}", mesh_of("mixed", True))
     whole = (tmp_path / f"b{suffix}").read_bytes()
-    with pytest.raises(MeshError, match=rf"b\{suffix}: VTK cannot read the file"):
+    with pytest.raises(MeshError, match=rf"b\{suffix}.*(cannot be read as XML|file is cut off)"):
         read_mesh(put(tmp_path, f"b{suffix}", whole[: len(whole) // 2]))
     quoted = whole.replace(b"POLYGONS", b"P\xffLYGONS").replace(b"<Polys", b"<\xffolys")
-    with pytest.raises(MeshError, match=rf"c\{suffix}: VTK cannot read the file"):
+    with pytest.raises(MeshError, match=rf"c\{suffix}.*(cannot be read as XML|no faces)"):
         read_mesh(put(tmp_path, f"c{suffix}", quoted))
     strip = pyvista.PolyData(np.array(QUAD), strips=[4, 0, 1, 3, 2])
     strip.save(tmp_path / f"c{suffix}")
@@ -443,15 +443,8 @@ def test_vtk_of_another_kind(tmp_path):
     import pyvista
 
     pyvista.ImageData(dimensions=(2, 2, 2)).save(tmp_path / "a.vtk")
-    with pytest.raises(MeshError, match=r"it holds a ImageData, not polygons. Take its surface first"):
+    with pytest.raises(MeshError, match=r"it holds a STRUCTURED_POINTS, not polygons. Take its surface first"):
         read_mesh(tmp_path / "a.vtk")
-
-
-def test_vtk_warnings_are_passed_on(tmp_path, monkeypatch):
-    write_mesh(tmp_path / "a.vtp", mesh_of("mixed", False))
-    monkeypatch.setattr(_io._vtk, "_watch", lambda act: (act(), "Warning: the file is newer than the reader"))
-    with pytest.warns(UserWarning, match=r"a\.vtp: VTK says: Warning: the file is newer"):
-        read_mesh(tmp_path / "a.vtp")
 
 
 def test_stl_text_of_two_solids(tmp_path):
@@ -539,7 +532,24 @@ def test_unchecked_for_repair(tmp_path):
         ("0,1.5, 2\n3,4,5\n", False, False),
         ("0; 1.5;2\n3;4;5\n", False, False),
         ("0 1.5 2\r3 4 5\r", False, False),
-        ("0 1.5 2 1 0 0\n3 4 5 0 2 0\n", True, False),
+        ("0;1,5;2\n3;4;5\n", False, False),
+        ("0,0 1,5 2,0\n3,0 4,0 5,0\n", False, False),
+        ("2\n0 1.5 2\n3 4 5\n", False, False),
+        ("// a comment\n; another\n0 1.5 2\n3 4 5\n", False, False),
+        ("//X Y Z Nx Ny Nz\n0 1.5 2 1 0 0\n3 4 5 0 2 0\n", True, False),
+        ("x [mm] y [mm] z [mm] nx ny nz\n0 1.5 2 1 0 0\n3 4 5 0 2 0\n", True, False),
+        ("x (mm);y (mm);z (mm)\n0;1,5;2\n3;4;5\n", False, False),
+        (
+            '"Point ID","Points:0","Points:1","Points:2","Normals:0","Normals:1","Normals:2"\n0,0,1.5,2,1,0,0\n'
+            "1,3,4,5,0,2,0\n",
+            True,
+            False,
+        ),
+        ("x\ty\tz\tcontour type\tslice\n0\t1.5\t2\tLV ENDO\t0\n3\t4\t5\tLV ENDO\t0\n", False, False),
+        ('x,y,z,label\n0,1.5,2,"#1"\n3,4,5,"a\nb, c"\n', False, False),
+        ("x,y,z,label\n0,1.5,2,#1\n3,4,5,#2\n", False, False),
+        (";x;y;z\n0;0;1,5;2\n1;3;4;5\n", False, False),
+        ("x,y,z,nx,ny,nz\n0,1.5,2,1,0,0\n3,4,5,0,2,0\n", True, False),
         ("X Y Z\n0 1.5 2\n3 4 5\n", False, False),
         ("z,label,y,weight,x\n2,LV ENDO,1.5,0.5,0\n5,,4,2,3\n", False, True),
         ('"x";"y";"z";"name"\n0;1.5;2;"a;b"\n3;4;5;c\n', False, False),
@@ -562,10 +572,12 @@ def test_point_tables(tmp_path, suffix, text, has_normals, has_weights):
 def test_point_tables_keep_every_digit(rows):
     with tempfile.TemporaryDirectory() as folder:
         for separator in (" ", ",", ";", "\t"):
-            text = "\n".join(separator.join(map(repr, row)) for row in rows.tolist())
+            names = separator.join(("x", "y", "z", "nx", "ny", "nz")[: rows.shape[1]])
+            text = "\n".join([names, *(separator.join(map(repr, row)) for row in rows.tolist())])
             cloud = read_points(put(Path(folder), "a.xyz", text))
             np.testing.assert_array_equal(cloud.points, rows[:, :3])
-            if rows.shape[1] == 6:
+            assert (cloud.normals is None) == (not rows[:, 3:].any())
+            if cloud.normals is not None:
                 np.testing.assert_array_equal(cloud.normals, rows[:, 3:])
 
 
@@ -636,9 +648,9 @@ SOUND = [
         ("a.ply", "ply\nformat binary 1.0\nend_header\n", "line 2: 'format binary 1.0' has no meaning in a PLY header"),
         ("a.ply", BINARY + "property float x\nend_header\n", "line 3: 'property float x' has no meaning"),
         ("a.ply", BINARY + "element vertex 1\nproperty real x\nend_header\n", "line 4: 'property real x' has no"),
-        ("a.ply", BINARY + "element vertex 1\nproperty float x\nproperty int x\nend_header\n", "'vertex' has two"),
+        ("a.ply", BINARY + "element vertex 0\nproperty float x\nproperty int x\nend_header\n", "'vertex' has two"),
         ("a.ply", BINARY + "element point 0\nend_header\n", "there is no element 'vertex'"),
-        ("a.ply", BINARY + "element vertex 2\nend_header\n", "the element 'vertex' needs the properties x, y and z"),
+        ("a.ply", BINARY + "element vertex 2\nend_header\n\n\n", "element 'vertex' needs the properties x, y and z"),
         ("a.ply", ASCII_PLY[:-10], "the header announces 1 rows of 'face', but only 0 are there"),
         ("a.ply", ASCII_PLY.replace("4 0 1 2 3", "4 0 1 2"), r"line 16: .* 'face' should have 5 .* but has 4"),
         ("a.ply", ASCII_PLY.replace("4 0 1 2 3", "nan 0 1 2"), "line 16: a row of 'face' should have 1 numbers"),
@@ -661,10 +673,10 @@ SOUND = [
         ("a.stl", STL_TEXT.format("0 1 0"), "1 facets with 3 corners up to line 8, .* closing 'endsolid' are expected"),
         ("a.stl", "solid a\nfacet\nvertex 0 0 0\nendsolid", "1 facets with 1 corners up to line 4"),
         ("a.stl", "solid a\nendsolid", "it holds points but no faces"),
-        ("a.gii", "<a/>", "nibabel cannot read it as GIfTI"),
-        ("a.gii", "hello", "nibabel cannot read it as GIfTI"),
+        ("a.gii", "<a/>", "it is XML of 'a' and not of 'GIFTI'"),
+        ("a.gii", "hello", "it cannot be read as XML"),
         ("a.gii", '<?xml version="1.0"?><GIFTI Version="1.0" NumberOfDataArrays="0"></GIFTI>', "it holds 0 point sets"),
-        ("a.npz", "hello", "numpy cannot read it without unpickling"),
+        ("a.npz", "hello", "it begins neither as an .npz nor as an .npy file"),
         ("a.xyz", "0 0 0", r"\.xyz files hold points without faces. Read it with `read_points`"),
     ],
 )  # fmt: skip
@@ -696,23 +708,22 @@ def test_damage_raises_nothing_else(data):
     [
         ("# nothing\n\n", r"a\.csv: it has no line of numbers"),
         ("x y z\n", r"a\.csv: it holds no points"),
-        ("# a\n1 2\n", r"a\.csv, line 2: 2 columns. Without a header row there must be 3 columns \(x, y, z\) or 6"),
-        ("1 2 3 4\n", "line 1: 4 columns. Without a header row"),
+        ("# a\n1 2\n", r"a\.csv, line 2: 2 columns. A point needs at least x, y and z"),
         ("a,b,c\n1,2,3\n", "line 1: a header row must name x, y and z, .* this one has a, b, c"),
         ("x,y,z,nx\n1,2,3,4\n", "must name x, y and z, all of nx, ny, nz or none, and none twice"),
         ("x,y,z,x\n1,2,3,4\n", "must name x, y and z, all of nx, ny, nz or none, and none twice"),
         ("1 2 3\n\n1 2 3 4\n", "line 3: 4 columns, where the first row has 3"),
         ("x,y,z,l\n1,2,3,a\n1,2,3\n", "line 3: 3 columns, where the first row has 4"),
         ("1,2,3\n1,b,3\n", "line 2: 'b' is not a number. Write decimals with a point"),
-        ("1;2;3\n1;2,5;3\n", "line 2: '2,5' is not a number. Write decimals with a point"),
-        ("x,y,z\n1,,3\n", "line 2: '' is not a number"),
+        ("1;2,5;3\n1;2.5;3\n", "line 1: the column has both commas and points. Write decimals with a point"),
+        ("x,y,z\n1,,3\n", "it holds no points. All 1 rows have coordinates that are not finite"),
+        ("250\n1 2 3\n4 5 6\n", "the first row announces 250 rows, but 2 follow. The file is cut off"),
+        ('x,y,z,l\n1,2,3,"a\n', "line 2: the row cannot be parsed .*Close its quotes"),
         ("x,y,z\n1,5,2,5,3,5\n", "line 2: 6 columns, where the first row has 3. Write decimals with a point"),
-        ("1,5 -2,25 3\n1,5 2,5 3\n", "line 1: '1,5' is not a number. Write decimals with a point"),
         ("1,257,-29,868,12,079\n2,257,-29,868,12,079\n", "6 columns of whole numbers, .*: decimal commas, it seems"),
         ("1 2 3\n1 2 3_0\n", "line 2: '3_0' is not a number"),
-        ("1,2,3\n1,2,3" + 200000 * "3" + ",4\n", "line 2: 1 columns, where the first row has 3"),
-        ("1 2 3\n1 2 \uff13\n", "the numbers cannot be read. Write them in plain digits"),
-        ("# a\n1 2 3\n1 nan 3\n1 2 3\ninf 1 2\n", r"a\.csv, line 3, 5: a number is not finite. Delete these rows"),
+        ("1,2,3\n1,2,3" + 200000 * "3" + ",4\n", "line 2: the row cannot be parsed .field larger"),
+        ("1 2 3\n1 2 \uff13\n", "line 2: '\uff13' is not a number"),
     ],
 )
 def test_point_tables_that_cannot_be_read(tmp_path, content, words):
@@ -728,12 +739,12 @@ def test_whole_numbers_in_named_columns_are_what_the_names_say(tmp_path):
 def test_not_finite_points_are_named_by_row(tmp_path):
     points = np.zeros((9, 3))
     points[[2, 5], 1] = np.nan
-    np.savez(tmp_path / "a.npz", points=points)
-    with pytest.raises(MeshError, match=r"a\.npz: points 2, 5, counted from zero, are not finite. Drop these rows"):
-        read_points(tmp_path / "a.npz")
-    np.savez(tmp_path / "a.npz", points=np.zeros((2, 3)), normals=points[1:3])
-    with pytest.raises(MeshError, match="normals 1, counted from zero, are not finite"):
-        read_points(tmp_path / "a.npz")
+    np.savez(tmp_path / "a.npz", points=points, weights=np.arange(9.0))
+    with pytest.warns(UserWarning, match=r"a\.npz: 2 of 9 points are not finite \(rows 2, 5, .*they were dropped"):
+        np.testing.assert_array_equal(read_points(tmp_path / "a.npz").weights, [0, 1, 3, 4, 6, 7, 8])
+    np.savez(tmp_path / "a.npz", points=np.zeros((2, 3)), normals=[(0, 0, 1), (0, 0, np.nan)])
+    with pytest.warns(UserWarning, match="1 of 2 normals are not finite; these points count as without one"):
+        np.testing.assert_array_equal(read_points(tmp_path / "a.npz").normals, [(0, 0, 1), (0, 0, 0)])
     np.savez(tmp_path / "a.npz", points=np.zeros((2, 3)), weights=[np.inf, 1])
     with pytest.raises(MeshError, match="weights 0, counted from zero, are not finite"):
         read_points(tmp_path / "a.npz")
@@ -752,7 +763,11 @@ def test_not_finite_points_are_named_by_row(tmp_path):
         ({"vertices": np.zeros((4, 3))}, read_mesh, "it holds points but no faces"),
         ({"vertices": np.zeros((4, 3)), "faces": np.zeros((4, 5), int)}, read_mesh, r"whole numbers .* \[4, 5\]"),
         ({"vertices": np.zeros((4, 3)), "faces": np.zeros((4, 3))}, read_mesh, "must be whole numbers .* got float64"),
-        ({"points": np.array([None])}, read_points, "numpy cannot read it without unpickling"),
+        ({"points": np.array([None])}, read_points, "the array 'points': it holds objects, where plain numbers are"),
+        ({"points": np.array(["2020-01-01"], "M8[D]")}, read_points, "the array 'points': it holds dates"),
+        ({"vertices": np.zeros((4, 3), complex)}, read_mesh, "the array 'vertices': it holds complex numbers"),
+        ({"vertices": np.zeros((4, 3)), "normals": np.full((4, 3), "a")}, read_mesh, "'normals': it holds text"),
+        ({"vertices": np.zeros(4, "f4,f4")}, read_mesh, "the array 'vertices': it holds '"),
     ],
 )  # fmt: skip
 def test_npz_that_cannot_be_read(tmp_path, saved, read, words):
@@ -795,7 +810,7 @@ def test_files_that_are_not_there_or_unknown(tmp_path, read):
     with pytest.raises(MeshError, match=r"a\.obj: the file is empty"):
         read(put(tmp_path, "a.obj", ""))
     with pytest.raises(
-        MeshError, match=r"a\.fbx: the suffix '\.fbx' is not known\. Meshes: \.obj, .*\.npz\. Points, besides: .*\.csv"
+        MeshError, match=r"a\.fbx: the suffix '\.fbx' is not known\. Meshes: \.obj, .*\.asc\. Points, besides: .*\.csv"
     ):
         read(put(tmp_path, "a.fbx", "a"))
 
@@ -887,10 +902,6 @@ def test_links_and_permissions_stay(tmp_path):
 @pytest.mark.parametrize(("module", "suffix"), [("pyvista", ".vtp"), ("pyvista", ".vtk"), ("nibabel.gifti", ".gii")])
 def test_a_missing_library_is_named(tmp_path, monkeypatch, module, suffix):
     monkeypatch.setitem(sys.modules, module, None)
-    words = rf"\{suffix}.* files need {module.split('.')[0]}.* pip install 'jaxsubdiv\[io\]'"
-    for act in (read_mesh, read_points):
-        with pytest.raises(ImportError, match=words if suffix == ".gii" else "pip install 'jaxsubdiv\\[io\\]'"):
-            act(put(tmp_path, f"a{suffix}", "a"))
     with pytest.raises(ImportError, match="pip install 'jaxsubdiv\\[io\\]'"):
         write_mesh(tmp_path / f"b{suffix}", mesh_of("triangles", False, np.float32))
     assert not (tmp_path / f"b{suffix}").exists()

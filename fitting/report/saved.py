@@ -131,7 +131,8 @@ def load_fit(folder: str | os.PathLike[str]) -> tuple[Fit, str]:
         arrays = _read(path)
         recipe = str(arrays["recipe"])
         Settings.from_json(recipe)  # what is wrong with it is told with the file
-        return _restore(arrays), recipe
+        with np.errstate(all="ignore"):  # numbers that are no fit's end in what is not finite
+            return _restore(arrays), recipe
     except KeyError as error:
         raise ValueError(f"{path}: {error.args[0]!r} is missing: the file is not one of a saved fit.") from None
     except (ValueError, TypeError, IndexError, AttributeError, AssertionError, OverflowError) as error:

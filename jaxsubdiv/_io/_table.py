@@ -109,6 +109,6 @@ def _are_halves(table: Table) -> bool:
 
     What follows such a comma has no sign. Few colours and no normals look so in all of the rows.
     """
-    whole = all(re.fullmatch("[+-]?[0-9]+", cell) for row in table.rows for cell in row)
-    signed = whole and any(row[place][0] in "+-" for row in table.rows for place in (1, 3, 5))
-    return whole and not signed and any(int(cell[:9]) > 1 for row in table.rows for cell in row[3:])
+    whole = all(re.fullmatch("[+-]?[0-9]+", cell.strip()) for row in table.rows for cell in row)
+    signed = whole and any(row[place].strip()[0] in "+-" for row in table.rows for place in (1, 3, 5))
+    return whole and not signed and any(int(cell.strip()[:9]) > 1 for row in table.rows for cell in row[3:])

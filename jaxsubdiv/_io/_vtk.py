@@ -12,7 +12,7 @@ from jaxtyping import Int, Shaped
 
 from ..errors import MeshError, name_rows
 from ._contents import Contents, VertexData, by_size, check_polygons, doubles, library
-from ._text import parse_numbers
+from ._text import parse_numbers, token_starts
 
 _NORMALS = "Normals"
 _TYPES = {
@@ -73,25 +73,22 @@ class _Cursor:
         return values.astype(dtype.newbyteorder("="))
 
     def _text_numbers(self, n: int) -> Shaped[np.ndarray, "n"]:
-        words: list[bytes] = []
-        while len(words) < n:
-            # Numbers take a few bytes each; what was taken too many is put back.
-            found = list(re.finditer(rb"\S+", self.data[self.at : self.at + 8 * (n - len(words)) + 100]))
-            whole = found if self.at + 8 * (n - len(words)) + 100 >= len(self.data) else found[:-1]
-            taken = whole[: n - len(words)]
-            if not taken:
-                self.refuse(f"{n} numbers are announced, but the file ends after {len(words)}")
-            words += [match[0] for match in taken]
-            self.at += taken[-1].end()
-        values = parse_numbers(b" ".join(words).decode("ascii", errors="replace"))
+        size, left = 16 * n + 100, len(self.data) - self.at
+        starts = token_starts(np.frombuffer(self.data, np.uint8, min(size, left), self.at))
+        while len(starts) <= n and size < left:
+            size *= 2
+            starts = token_starts(np.frombuffer(self.data, np.uint8, min(size, left), self.at))
+        if len(starts) < n:
+            self.refuse(f"{n} numbers are announced, but the file ends after {len(starts)}")
+        end = self.at + int(starts[n]) if len(starts) > n else len(self.data)
+        text = self.data[self.at : end].decode("ascii", errors="replace")
+        values = parse_numbers(text)
         if len(values) < n:
-            bad = next(word for word in words if len(parse_numbers(word.decode("ascii", errors="replace"))) != 1)
-            self.refuse(f"'{bad[:40].decode(errors='replace')}' is not a number")
+            self.refuse(
+                f"'{next(word for word in text.split() if len(parse_numbers(word)) != 1)[:40]}' is not a number"
+            )
+        self.at = end
         return values
-
-    def skip(self, n_bytes: int) -> None:
-        """Leave bytes out."""
-        self.at += n_bytes
 
     def count(self, words: list[str], place: int) -> int:
         """The whole number at a place of a line of words."""
