@@ -337,7 +337,9 @@ def check(scheme: js.AbstractScheme, topology: js.Topology, control: js.Control,
         raise ScanError("all scan points lie on one spot. Check the columns of the file.")
     if sizes[1] == 0:
         raise ValueError("all control vertices lie on one spot: there is no surface to start from.")
-    ratio = sizes[0] / sizes[1]
+    # Of the scan without its outermost points: a lone one far off must not look like another unit.
+    inner = np.diff(np.quantile(np.asarray(scan.points), [0.01, 0.99], axis=0), axis=0)
+    ratio = float(np.linalg.norm(inner) or sizes[0]) / sizes[1]
     if not 1 / _UNIT_RATIO <= ratio <= _UNIT_RATIO:
         raise ScanError(
             f"the scan measures {sizes[0]:.4g} across and the control mesh {sizes[1]:.4g}: their units differ, it "

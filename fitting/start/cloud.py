@@ -23,6 +23,7 @@ _SLICES_APART = 4.0  # times the spacing of the points in them: ten neighbours l
 _FLAT = 0.3  # thickness of a slice over its width
 # A point is dropped where it lies thinly and its neighbours make no plane: sparse but smooth parts stay.
 _THIN, _THICK = 1.7, 0.15
+_ALONE = 8.0  # times what nine tenths of the points keep: through a far point and a small object goes a plane, too
 # Neighbours on lines, or so much denser in one place than in another, tell of no surface: the points are thinned.
 _LINES, _UNEVEN = 0.1, 6.0
 _THINNINGS, _WIDER = 12, 1.4
@@ -131,12 +132,13 @@ def clean_points(
 
 
 def rows_on_surfaces(points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, "q"]:
-    """Rows of points that are not scattered in space: their neighbours are near, or lie in a plane."""
+    """Rows of points that are not scattered in space: their neighbours are near, or lie in a plane, and not far off."""
     rows = np.arange(len(points))
     for _ in range(2):  # once the most are gone, the rest lies more thinly than it did
         _, off, _ = plane_fits(points[rows])
         reach = neighbour_distance(points[rows], NEIGHBOUR)
-        rows = rows[~((reach > _THIN * np.quantile(reach, 0.2)) & (off > _THICK * reach))]
+        thin, alone = np.quantile(reach, [0.2, 0.9]) * (_THIN, _ALONE)
+        rows = rows[~((reach > thin) & (off > _THICK * reach) | (reach > alone))]
         if len(rows) < LEAST_POINTS:
             break
     return rows

@@ -44,24 +44,24 @@ def find_parts(cloud: Cloud, closed: bool | None) -> list[Part]:
         return sorted(found, key=lambda part: -part.dense.areas.sum())
     parts: list[Part] = []
     rest, n = _turned_outwards(cloud) if cloud.given else cloud, len(cloud.points)
+    found = reconstruct(rest, closed)
     while len(parts) < _MOST_PARTS:
-        found = reconstruct(rest, closed)
         own = _nearest_piece(found.cloud.points, found.cloud.reach, found.pieces)
         if parts and np.mean(own >= 0) < _ITS_OWN:
             break
         for i, dense in enumerate(found.pieces):
-            here, it = found.cloud, own == i
+            it = own == i
             if it.sum() >= LEAST_POINTS or not parts:
-                cut = _some_of(here, it)
                 topology = found.topology if i == 0 else face_topology({3: dense.faces, 4: np.zeros((0, 4), np.int64)})
-                parts.append(Part(cut, dense, topology))
+                parts.append(Part(_some_of(found.cloud, it), dense, topology))
         beside = _nearest_piece(rest.points, rest.reach, found.pieces) < 0
         if beside.sum() < max(_MORE * n, LEAST_POINTS):
             break
         try:
             rest = clean_points(rest.points[beside], rest.normals[beside] if rest.given else None)
+            found = reconstruct(rest, closed)
         except ScanError:
-            break  # scattered
+            break  # what is left is scattered
     return sorted(parts, key=lambda part: -part.dense.areas.sum())
 
 

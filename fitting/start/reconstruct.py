@@ -50,6 +50,8 @@ def reconstruct(cloud: Cloud, closed: bool | None) -> Reconstruction:
     for factor in _SMOOTHER:
         settled, implicit = settle(cloud, cell, factor)
         pieces = _pieces_of_surface(settled, implicit, closed)
+        if not pieces:
+            raise ScanError("no surface: the points are scattered in space. Was the right file read?")
         topology = face_topology({3: pieces[0].faces, 4: np.zeros((0, 4), np.int64)})
         if best is None or topology.genus < best.topology.genus:
             best = Reconstruction(settled, pieces, topology)
@@ -179,6 +181,8 @@ def _pieces(dense: Dense, chosen: Bool[np.ndarray, "t"]) -> np.ndarray:
 
 def _separate(dense: Dense) -> list[Dense]:
     """The pieces of a surface, the largest first, without specks."""
+    if not len(dense.faces):
+        return []
     piece = _pieces(dense, np.ones(len(dense.faces), bool))
     area = np.bincount(piece, dense.areas)
     largest_first = [i for i in np.argsort(area)[::-1] if area[i] > _SPECK * area.sum() or area[i] == area.max()]
