@@ -412,9 +412,53 @@ def test_vtk_normals_under_another_name_and_ascii(tmp_path):
     polydata = pyvista.PolyData(vertices, np.concatenate([[len(face), *face] for face in faces]))
     polydata.point_data["up"] = vertices / 8
     polydata.point_data.active_normals_name = "up"
+    polydata.field_data["names"] = ["a", "of a scan" * 20]
+    polydata.cell_data["Normals"] = np.ones((len(faces), 3))
     for suffix in (".vtp", ".vtk"):
-        polydata.save(tmp_path / f"a{suffix}", binary=False)
-        assert_same(read_mesh(tmp_path / f"a{suffix}"), ControlMesh(vertices, faces, vertices / 8))
+        for binary in (False, True):
+            polydata.save(tmp_path / f"a{suffix}", binary=binary)
+            assert_same(read_mesh(tmp_path / f"a{suffix}"), ControlMesh(vertices, faces, vertices / 8))
+
+
+@pytest.mark.parametrize("packer", ["None", "ZLib", "LZMA", "LZ4"])
+@pytest.mark.parametrize("mode", ["Ascii", "Binary", "Appended"])
+@pytest.mark.parametrize("header", ["UInt32", "UInt64"])
+def test_vtp_in_every_encoding(tmp_path, packer, mode, header):
+    import pyvista
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+    vertices, faces = mixed_closed()
+    polydata = pyvista.PolyData(np.tile(vertices, (200, 1)), np.concatenate([[len(face), *face] for face in faces]))
+    writer = vtkXMLPolyDataWriter()
+    writer.SetFileName(str(tmp_path / "a.vtp"))
+    writer.SetInputData(polydata)
+    getattr(writer, f"SetDataModeTo{mode}")()
+    getattr(writer, f"SetCompressorTypeTo{packer}")()
+    getattr(writer, f"SetHeaderTypeTo{header}")()
+    writer.SetBlockSize(1024)
+    for encode in (False, True) if mode == "Appended" else (True,):
+        writer.SetEncodeAppendedData(encode)
+        writer.SetByteOrder(int(encode))
+        writer.Write()
+        if packer == "LZ4" and mode != "Ascii":
+            with pytest.raises(MeshError, match=r"it is packed by vtkLZ4DataCompressor. Save it with zlib"):
+                read_mesh(tmp_path / "a.vtp")
+            continue
+        assert_same(read_mesh(tmp_path / "a.vtp"), ControlMesh(np.tile(vertices, (200, 1)), faces))
+
+
+def test_gifti_in_every_encoding(tmp_path):
+    from nibabel.gifti import gifti
+
+    vertices, faces = octahedron()
+    for encoding in ("ASCII", "B64BIN", "B64GZ"):
+        for order in ("RowMajorOrder", "ColumnMajorOrder"):
+            arrays = [
+                gifti.GiftiDataArray(np.float32(vertices), "NIFTI_INTENT_POINTSET", encoding=encoding, ordering=order),
+                gifti.GiftiDataArray(np.array(faces, np.int32), "NIFTI_INTENT_TRIANGLE", encoding=encoding),
+            ]
+            path = put(tmp_path, "a.gii", gifti.GiftiImage(darrays=arrays).to_bytes())
+            assert_same(read_mesh(path), ControlMesh(vertices, faces))
 
 
 @pytest.mark.parametrize("suffix", [".vtp", ".vtk"])

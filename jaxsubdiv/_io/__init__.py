@@ -1,7 +1,7 @@
 """Meshes and scan points from files, and meshes to files.
 
-One module a format; this one picks it by the suffix and checks what it gives. Libraries of the extra `io` are loaded by
-the formats that need them, when they need them.
+One module a format; this one picks it by the suffix and checks what it gives. Libraries of the extra `io` write
+some formats and are loaded when they do; none reads, since what a damaged file announces can end the interpreter there.
 """
 
 import errno
@@ -86,12 +86,13 @@ def read_mesh(path: str | os.PathLike[str], *, scale: float | int = 1.0, check: 
 
     - `.obj`: texture coordinates, groups and materials are left out. Where the corners at a vertex name several
       different normals, the vertex gets their unit mean, with a warning. Normals that no face names are taken when
-      there is one a vertex.
+      there is one a vertex. Surfaces of the MNI tools as text have this suffix too, and are read.
     - `.ply`: text, or binary of either byte order; other properties are left out.
     - `.off`: also NOFF; colours are left out.
     - `.stl`: text or binary; equal corners become one vertex; the normals of the facets are left out.
-    - `.vtp`, `.vtk`: polygons (legacy VTK: of a POLYDATA file), needs pyvista.
-    - `.gii`: GIfTI, needs nibabel. Coordinates stay as stored: a coordinate transform in the file that is not the
+    - `.vtp`, `.vtk`: polygons (legacy VTK: of a POLYDATA file).
+    - `.asc`: surfaces of FreeSurfer as text.
+    - `.gii`: GIfTI. Coordinates stay as stored: a coordinate transform in the file that is not the
       identity is not applied, and a warning says so.
     - `.npz`: `control_points`, `control_faces`, `control_normals`; or `vertices`, `normals` and `faces`, or `triangles`
       and `quads`.
@@ -105,7 +106,6 @@ def read_mesh(path: str | os.PathLike[str], *, scale: float | int = 1.0, check: 
         FileNotFoundError: there is no such file.
         MeshError: the file is not what its suffix says, or damaged, or holds no faces or faces of five or more corners,
             or is not a mesh that `ControlMesh` takes. The text names the file and, where it is text, the line.
-        ImportError: the format needs a library of the extra `io` which is not installed.
         ValueError: `scale` is not positive and finite.
     """
     path, format_ = _open(path)

@@ -91,15 +91,22 @@ def _rows(path: Path, array: Element) -> Shaped[np.ndarray, "n 3"]:
         raise MeshError(
             f"{path.name}: the array {_intent(array)[:40]}: {text}. The file is cut off or damaged."
         ) from None
-    return values.reshape(shape, order="F" if array.get("ArrayIndexingOrder") in ("ColumnMajorOrder", "2") else "C")
+    # Of text every line is a row, as nibabel writes and reads it whatever the order.
+    by_columns = array.get("ArrayIndexingOrder") in ("ColumnMajorOrder", "2") and _encoding(array) != "ASCII"
+    return values.reshape(shape, order="F" if by_columns else "C")
+
+
+def _encoding(array: Element) -> str:
+    name = array.get("Encoding", "")
+    return _ENCODINGS.get(name, name)
 
 
 def _values(path: Path, array: Element) -> Shaped[np.ndarray, "n"]:
     kind, n = array.get("DataType", "").removeprefix("NIFTI_TYPE_"), math.prod(_shape(array))
     dtype = np.dtype(_TYPES.get(kind) or _CODES.get(kind) or _unknown(f"the type '{kind[:40]}' is not read"))
     dtype = dtype.newbyteorder(">" if array.get("Endian") in ("BigEndian", "1") else "<")
-    encoding, text = array.get("Encoding", ""), array.findtext("Data") or ""
-    match _ENCODINGS.get(encoding, encoding):
+    text = array.findtext("Data") or ""
+    match _encoding(array):
         case "ASCII":
             values: Float[np.ndarray, "n"] = parse_rows(path, text).values
         case "Base64Binary":

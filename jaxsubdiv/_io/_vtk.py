@@ -90,6 +90,15 @@ class _Cursor:
         self.at = end
         return values
 
+    def skip_string(self) -> None:
+        """Leave out a line, or in a binary file what its first two bits give the length of."""
+        if self.is_text:
+            self.line()
+            return
+        n_bytes = 8 >> (self.data[self.at] >> 6) if self.at < len(self.data) else 1
+        length = int.from_bytes(self.data[self.at : self.at + n_bytes], "big") & ((1 << (8 * n_bytes - 2)) - 1)
+        self.at += n_bytes + length
+
     def count(self, words: list[str], place: int) -> int:
         """The whole number at a place of a line of words."""
         if len(words) <= place or not re.fullmatch("[0-9]{1,18}", words[place]):
@@ -251,9 +260,9 @@ def _read_field(cursor: _Cursor, n_arrays: int) -> dict[int, np.ndarray] | None:
         if not words:
             return found
         n_columns, n = cursor.count(words, 1), cursor.count(words, 2)
-        if words[-1] == "string" and cursor.is_text:
+        if words[-1] == "string":
             for _ in range(min(n_columns * n, len(cursor.data))):
-                cursor.line()
+                cursor.skip_string()
         elif words[-1] not in _TYPES:
             return None
         else:
