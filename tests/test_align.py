@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import fitting
 import jaxsubdiv as js
 from fitting import Landmarks, Scan, ScanError
-from fitting.start.align import _surface
+from fitting.start.align import sample_faces
 
 SIZE = 100.0
 FAR = Rotation.from_rotvec(np.array([0.4, -0.7, 0.6]) / np.linalg.norm([0.4, -0.7, 0.6]) * np.pi)
@@ -50,7 +50,7 @@ def scan_of(
 ) -> np.ndarray:
     """Points on the flat faces, with noise, among outliers that fill the bounding box."""
     rng = np.random.default_rng(seed)
-    points = rng.permutation(_surface(mesh, n).points)
+    points = rng.permutation(sample_faces(mesh, n).points)
     points = points + rng.normal(scale=sigma, size=points.shape)
     count = round(outliers * n)
     low, high = points.min(axis=0), points.max(axis=0)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxsubdiv as js
 from fitting import Scan, ScanError, control_mesh, topology_of
-from fitting.start.align import _surface
+from fitting.start.align import sample_faces
 from fitting.start.orient import orient, plane_fits
 from fitting.start.poisson import poisson
 from fitting.start.remesh import Coarse, _collapsed, paired
@@ -362,7 +362,7 @@ def test_real_scans(shared_data, name):
     check_sound(mesh, 1000, "quad" if "face" in name else "triangle")
     assert topology_of(mesh) == REAL[name]
     size = np.ptp(points, axis=0).max()
-    near = KDTree(_surface(mesh, 20_000).points).query(points)[0]
+    near = KDTree(sample_faces(mesh, 20_000).points).query(points)[0]
     assert np.median(near) < 0.012 * size
     assert np.median(KDTree(points).query(mesh.vertices)[0]) < 0.03 * size
 

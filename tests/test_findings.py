@@ -3,19 +3,24 @@
 import dataclasses
 import functools
 import json
+from importlib.util import find_spec
+from pathlib import Path
 
 import meshes
 import numpy as np
 import pytest
 from scans import N_POINTS, noise, problem
+from scipy.spatial import ConvexHull, KDTree
 
 import fitting
 import jaxsubdiv as js
 from fitting import Scan
+from fitting.__main__ import main
 from fitting.finding import Finding, Origin, Pose
 from fitting.report.evidence import own_noise, share_of_two_walls
 from fitting.report.findings import CHECKS, Evidence, check_jumps, check_noise, gather_evidence
 from fitting.report.record import Fit
+from fitting.start.align import mirror_image, sample_faces
 
 TWO = Finding("parts_left_out", "the scan shows 2 parts", {"parts": 2, "share": 0.5})
 
@@ -186,9 +191,7 @@ def template() -> js.ControlMesh:
 
 
 def points_on(mesh: js.ControlMesh, n: int = 1500, seed: int = 0) -> np.ndarray:
-    from fitting.start.align import _surface
-
-    return _surface(mesh, n).points + np.random.default_rng(seed).normal(scale=0.1, size=(n, 3))
+    return sample_faces(mesh, n).points + np.random.default_rng(seed).normal(scale=0.1, size=(n, 3))
 
 
 def test_a_template_in_its_place_among_two_objects_stays():
@@ -209,8 +212,6 @@ def test_a_scale_that_no_two_people_differ_by_is_told():
 
 def test_the_other_side_of_the_body():
     """A mirrored scan is told; with the template's mirror image it is fitted, and its control mesh is sound."""
-    from fitting.start.align import mirror_image
-
     mesh = template()
     scan = Scan(points_on(mesh) * (-1, 1, 1) + (50, 0, 0))
     with pytest.warns(UserWarning, match="give --mirror"):
@@ -229,3 +230,95 @@ def test_mirroring_needs_a_template_to_align():
         fitting.fit_scan(Scan(points_on(template())), mirror=True)
     with pytest.raises(ValueError, match="let it be aligned by a `pose`"):
         fitting.fit_scan(Scan(points_on(template())), template(), mirror=True, pose=None)
+
+
+# ------------------------------------------------------------------------------------------- scans of several objects
+
+CASES = Path(__file__).parents[2] / "shared" / "cases"
+needs_cases = pytest.mark.skipif(not CASES.is_dir(), reason=f"{CASES} is not there: these scans are not ours to ship")
+needs_extra = pytest.mark.skipif(find_spec("pyacvd") is None, reason="the extra `mesh` is not installed")
+
+
+def ball(n: int = 1200, radius: float = 20.0, seed: int = 0) -> np.ndarray:
+    x = np.random.default_rng(seed).normal(size=(n, 3))
+    return radius * x / np.linalg.norm(x, axis=1, keepdims=True)
+
+
+@functools.cache
+def two_objects() -> Scan:
+    return Scan(np.concatenate([ball() * (1, 1, 2), ball(700, 15, 1) + (60, 0, 0)]))
+
+
+@needs_extra
+def test_what_is_left_out_is_a_choice():
+    with pytest.warns(UserWarning, match=r"the scan shows 2 parts; .* Left out: 3\d% of the points. Choose by --part"):
+        largest = fitting.control_mesh(two_objects(), faces=40)
+    assert np.abs(largest.vertices[:, 0]).max() < 25
+    assert np.array_equal(fitting.control_mesh(two_objects(), faces=40, part="largest").vertices, largest.vertices)
+    nearest = fitting.control_mesh(two_objects(), faces=40, part="nearest")  # to the middle of the points: x = 22
+    assert np.abs(nearest.vertices[:, 0]).max() < 25
+    both = fitting.control_mesh(two_objects(), faces=80, part="all")
+    both.check()
+    assert fitting.topology_of(both).parts == 2 and fitting.topology_of(both).is_closed
+
+
+@needs_extra
+def test_faces_of_a_scan_tell_its_parts_apart():
+    """Two balls that touch, which points alone show as one; and a vertex that no face uses."""
+    faces = ConvexHull(ball()).simplices
+    both = np.concatenate([ball(), ball() + (40.2, 0, 0), [[20.0, 500, 0]]])
+    scan = Scan(both, faces=np.concatenate([faces, faces + 1200]))
+    mesh = fitting.control_mesh(scan, faces=40, part="largest")
+    assert np.ptp(mesh.vertices[:, 0]) < 42 and np.abs(mesh.vertices[:, 1]).max() < 22
+    assert scan.rows(np.arange(1200)).faces.shape == faces.shape
+    with pytest.raises(fitting.ScanError, match="`faces` name points that there are not: the scan has 1200"):
+        Scan(ball(), faces=faces + 1)
+
+
+@needs_extra
+def test_too_few_faces_for_what_the_scan_shows():
+    arm = np.random.default_rng(0).uniform(size=(3000, 2)) * (2 * np.pi, 100)
+    tube = np.stack([2 * np.cos(arm[:, 0]), 2 * np.sin(arm[:, 0]), arm[:, 1]], axis=1)
+    with pytest.raises(fitting.ScanError, match=r"faces (leaves out a part of the scan|are too few)"):
+        fitting.control_mesh(Scan(np.concatenate([tube, tube[:, [2, 0, 1]], tube[:, [1, 2, 0]]])), faces=16)
+
+
+@needs_extra
+def test_a_lone_far_point_repeats_and_zeros_change_nothing():
+    points = ball() + (300, 0, 0)
+    odd = np.concatenate([points, points[:400], np.zeros((300, 3)), [[9000.0, 0, 0]]])
+    mesh = fitting.control_mesh(Scan(odd), faces=40)
+    assert np.abs(np.linalg.norm(mesh.vertices - (300, 0, 0), axis=1) - 20).max() < 1.5
+
+
+@needs_extra
+@needs_cases
+@pytest.mark.parametrize("name", ["tibia_table", "tibia_two"])
+def test_of_two_objects_none_is_left_out_without_a_word(name):
+    with pytest.warns(UserWarning, match=r"the scan shows 2 parts; .* Left out: [45]\d% of the points"):
+        fitting.control_mesh(fitting.read_scan(CASES / f"{name}.xyz"), faces=150)
+
+
+@needs_extra
+@needs_cases
+def test_dense_contours_are_the_whole_bone():
+    scan = fitting.read_scan(CASES / "tibia_slices5.xyz")
+    mesh = fitting.control_mesh(scan, faces=300)
+    off = KDTree(sample_faces(mesh, 20_000).points).query(np.asarray(scan.points))[0]
+    assert np.median(off) < 2 and np.quantile(off, 0.95) < 8  # flat faces over round ends, of a bone of 350 mm
+    assert fitting.topology_of(mesh) == (1, 0, 0, 2)
+
+
+@needs_extra
+def test_the_command_tells_last_what_it_left_out(tmp_path, capsys):
+    np.savetxt(tmp_path / "two.xyz", np.asarray(two_objects().points))
+    words = [str(tmp_path / "two.xyz"), "--faces", "30", "--levels", "1", "-o", str(tmp_path / "out")]
+    assert main(words) == 1
+    text = capsys.readouterr().out
+    assert "NOT TO BE TRUSTED" in text
+    assert text.splitlines()[-1].startswith("WARNING  the scan shows 2 parts")
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert [finding["name"] for finding in report["warnings"]] == ["parts_left_out"]
+    assert report["n_points"] == 1200  # those of the other part are not fitted
+    assert main([*words, "--part", "largest"]) == 0
+    assert "WARNING" not in capsys.readouterr().out

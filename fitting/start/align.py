@@ -184,19 +184,19 @@ def align(
         if start is None:
             raise ScanError("without `refine` the landmarks must fix the pose: give three or more, not on a line.")
         found = _Found(start, 0.0, np.zeros(0))
-        return _finish(mesh, scan, points, found, [], _surface(mesh, _FINE[1]), placed, keep, doubts)
+        return _finish(mesh, scan, points, found, [], sample_faces(mesh, _FINE[1]), placed, keep, doubts)
 
-    moments, of_mesh = _moments(points, "scan"), _moments(_surface(mesh, _FINE[1]).points, "template")
+    moments, of_mesh = _moments(points, "scan"), _moments(sample_faces(mesh, _FINE[1]).points, "template")
     unit = _unit_doubt(moments.size, of_mesh.size)
     if unit and start is None:
         raise ScanError(unit)
     doubts += [Finding("unit", unit, {"scan": moments.size, "template": of_mesh.size})] if unit else []
 
     poses = _starts(of_mesh, moments, kind) if start is None else [start]
-    surface, few = _surface(mesh, _COARSE[1]), _rows(points, _COARSE[0])
+    surface, few = sample_faces(mesh, _COARSE[1]), _rows(points, _COARSE[0])
     free = "similarity" if kind == "affine" else kind
     best = _best_starts(poses, few, surface, free, keep, placed)
-    surface, many = _surface(mesh, _FINE[1]), _rows(points, _FINE[0])
+    surface, many = sample_faces(mesh, _FINE[1]), _rows(points, _FINE[0])
     fine = [_search(found.pose, many, surface, free, keep, placed, _FINE_STEPS) for found in best]
     near = _near(fine)
     chosen = min(
@@ -204,7 +204,7 @@ def align(
     )
     others: list[_Found] = []
     if start is None:
-        own = _search(chosen.pose, few, _surface(mesh, _COARSE[1]), free, keep, None, _COARSE_STEPS)
+        own = _search(chosen.pose, few, sample_faces(mesh, _COARSE[1]), free, keep, None, _COARSE_STEPS)
         fits = np.quantile(own.distances, _SURE) < _FITS * moments.size
         other = own if fits else _mirrored(mesh, few, of_mesh, moments, free, keep)
         as_it_is, mirrored = (one.near_score(_near([own, other])) for one in (own, other))
@@ -229,7 +229,7 @@ def align(
 # --------------------------------------------------------------------------------------------------- what is compared
 
 
-def _surface(mesh: js.ControlMesh, n: int) -> _Surface:
+def sample_faces(mesh: js.ControlMesh, n: int) -> _Surface:
     """About `n` samples of the faces, quads as two triangles: low-discrepancy, so that they are even without a seed."""
     triangles = np.concatenate([mesh.faces[3], mesh.faces[4][:, [0, 1, 2]], mesh.faces[4][:, [0, 2, 3]]])
     a, b, c = np.moveaxis(mesh.vertices[triangles], 1, 0)
@@ -513,7 +513,7 @@ def _mirrored(
 ) -> _Found:
     """The best fit to the template seen in a mirror, from the starts that the template itself had."""
     flip = np.diag([-1.0, 1.0, 1.0])
-    surface = _surface(mesh, _COARSE[1])
+    surface = sample_faces(mesh, _COARSE[1])
     x = surface.points @ flip
     surface = surface._replace(points=x, normals=surface.normals @ flip, tree=KDTree(x))
     axes = flip @ template.axes @ np.diag([1.0, 1.0, -1.0])

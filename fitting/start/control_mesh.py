@@ -13,6 +13,7 @@ from jaxsubdiv.half_edges import half_edges
 from ..finding import Finding
 from ..scan.closest_points import nearest_rows
 from ..scan.scan import Scan, ScanError
+from .align import sample_faces
 from .cloud import Cloud, clean
 from .parts import Part, PartKind, choose, find_parts, points_of_others
 from .remesh import Coarse, Dense, coarsen, paired, relaxed
@@ -21,6 +22,7 @@ FaceKind: TypeAlias = Literal["triangle", "quad"]
 
 _LEAST_FACES = 16
 _SIZES = (1.0, 5000.0)  # mm: what is smaller or larger is hardly anatomy, but in another unit
+_SAMPLES, _FAR_OFF = 10_000, 0.3  # tips of what is long lie off a few faces, too: the fit reaches those
 _MAD = 1.4826
 _CUT = 4.685
 _BENT = 0.2  # cosine
@@ -105,7 +107,21 @@ def _mesh_of(part: Part, faces: int, kind: FaceKind) -> js.ControlMesh:
         )
     coarse = relaxed(paired(coarse) if kind == "quad" else coarse, part.dense)
     vertices, normals = _onto_points(coarse, part.dense, part.cloud)
-    return js.ControlMesh(vertices, {size: rows.astype(np.int32) for size, rows in coarse.faces.items()}, normals)
+    mesh = js.ControlMesh(vertices, {size: rows.astype(np.int32) for size, rows in coarse.faces.items()}, normals)
+    _check_near(mesh, part)
+    return mesh
+
+
+def _check_near(mesh: js.ControlMesh, part: Part) -> None:
+    """Raise where so few faces leave out a part of what the scan shows."""
+    points = part.cloud.points
+    off = np.quantile(KDTree(sample_faces(mesh, _SAMPLES).points).query(points)[0], 0.9)
+    size = np.linalg.norm(np.ptp(points, axis=0))
+    if off > _FAR_OFF * size:
+        raise ScanError(
+            f"a control mesh of {mesh.n_faces} faces leaves out a part of the scan: a tenth of the points lie over "
+            f"{off:.3g} mm from it, for a size of {size:.3g} mm. Ask for more faces."
+        )
 
 
 def _side_by_side(meshes: list[js.ControlMesh]) -> js.ControlMesh:

@@ -248,6 +248,7 @@ def mixed_normals(shared: Path) -> Situation:
         js.ControlMesh(ball.vertices, ball.faces, ball.vertex_normals),
         {"levels": 2},
         outer.points,
+        deserves_a_word=True,
     )
 
 
@@ -382,7 +383,7 @@ SITUATIONS: dict[str, Callable[[Path], Situation]] = {
     "template 50 mm off, not aligned": far_template(50.0),
     "template 300 mm off, not aligned": far_template(300.0),
     "template 5 m off, not aligned": far_template(5000.0),
-    "vessel of 16 faces": tubes(30),
+    "vessel of 30 faces": tubes(30),
     "vessel of 400 faces": tubes(400),
     "mirrored scan": mirrored,
     "head, template of a femur": other_anatomy("head_colin27.ply", "femur_tri.obj"),
@@ -408,7 +409,7 @@ SITUATIONS: dict[str, Callable[[Path], Situation]] = {
 
 
 def is_wrong(result: fitting.FitResult, truth: Float[np.ndarray, "n 3"]) -> tuple[bool, str]:
-    """Whether the surface misses what it should show, and by how much: median and worst tenth, of the worse direction."""
+    """Whether the surface misses what it should show, by how much: median and worst tenth, in the worse direction."""
     surface = fit_protocol.surface_of(result)
     samples = fit_protocol.sample(surface, 60_000, np.random.default_rng(0)).points
     both_ways = KDTree(samples).query(truth)[0], KDTree(truth).query(samples)[0]
