@@ -13,7 +13,7 @@ from jaxsubdiv import corner_weights
 from jaxsubdiv.linalg import dot, norm, unit
 
 from ..scan.closest_points import boundary_vertices, nearest_rows
-from ..scan.outliers import NEIGHBOURS, is_dense, scattered_points
+from ..scan.outliers import NEIGHBOURS, first_of_each, is_dense, scattered_points
 from ..scan.scan import Scan
 from ..scan.slices import Strokes, find_strokes
 from .priors.shifts import SlicePlanes
@@ -72,11 +72,14 @@ def surroundings(scan: Scan) -> Surroundings:
     crowded, scattered = np.zeros((2, scan.n_points), bool)
     neighbours = np.zeros((scan.n_points, min(_NEIGHBOURS, max(len(counted) - 1, 1))), np.int32)
     if len(counted):
-        distances, rows = nearest_rows(KDTree(points), points, min(NEIGHBOURS + 1, len(points)))
+        apart = counted[first_of_each(points)]
+        others = points if len(apart) == len(counted) else np.asarray(scan.points)[apart]
+        distances, rows = nearest_rows(KDTree(others), points, min(NEIGHBOURS + 1, len(others)))
         crowded[counted] = is_dense(distances[:, -1])
         scattered[counted] = scattered_points(points, crowded[counted])
-        if len(counted) > 1:
-            neighbours[counted] = counted[rows[:, 1 : _NEIGHBOURS + 1]]
+        if len(others) > 1:
+            near = apart[rows[:, 1 : _NEIGHBOURS + 1]]
+            neighbours[counted, : near.shape[1]] = near
     clean = scan.slices is None and crowded.sum() > _CLEAN * len(counted)
     return Surroundings(crowded, scattered, crowded & clean, neighbours)
 

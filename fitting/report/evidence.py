@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
 from ..scan.closest_points import nearest_rows
+from ..scan.outliers import first_of_each
 from ..start.cloud import rows_on_surfaces
 from ..start.orient import plane_fits
 
@@ -42,7 +43,7 @@ def own_noise(points: Float[np.ndarray, "p 3"], counted: Bool[np.ndarray, "p"]) 
     rows = np.flatnonzero(counted)
     if len(rows) > _MOST:
         rows = np.sort(np.random.default_rng(0).choice(rows, _MOST, replace=False))
-    rows = rows[np.sort(np.unique(points[rows], axis=0, return_index=True)[1])]
+    rows = rows[first_of_each(points[rows])]
     sampled = np.zeros(len(points), bool)
     if len(rows) > 2 * _NEIGHBOURS:
         rows = rows[rows_on_surfaces(points[rows])]

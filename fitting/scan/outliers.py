@@ -53,6 +53,11 @@ def neighbour_distance(points: Float[np.ndarray, "p 3"], k: int = NEIGHBOURS) ->
     return nearest_rows(KDTree(points), points, min(k + 1, len(points)))[0][:, -1]
 
 
+def first_of_each(points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, "q"]:
+    """Rows of the points without repeats: those would be each other's neighbours, and make all others seem thin."""
+    return np.sort(np.unique(points, axis=0, return_index=True)[1])
+
+
 def one_a_cell(points: Float[np.ndarray, "p 3"], cell: float) -> Int[np.ndarray, "c"]:
     """Row of the first point in every cell of a cubic grid that holds any: evens out the density.
 

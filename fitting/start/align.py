@@ -15,7 +15,7 @@ import jaxsubdiv as js
 from ..finding import Finding, Pose
 from ..scan.closest_points import nearest_rows
 from ..scan.landmarks import Landmarks, Placed, place_landmarks
-from ..scan.outliers import dense_points, one_a_cell
+from ..scan.outliers import dense_points, first_of_each, one_a_cell
 from ..scan.scan import Scan, ScanError
 
 Kind: TypeAlias = Literal["rigid", "similarity", "affine"]
@@ -249,7 +249,7 @@ def _thinned(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "q 3"]:
     """The scan without what is scattered, at an even density."""
     if len(points) < 10:
         raise ScanError(f"a scan of {len(points)} points cannot be aligned; 10 are the least.")
-    points = _rows(points, _AT_MOST)
+    points = _rows(points[first_of_each(points)], _AT_MOST)
     dense = points[dense_points(points)]
     extent = np.ptp(dense, axis=0).max()
     cell = extent / 40

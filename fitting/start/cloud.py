@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from ..scan.closest_points import nearest_rows
-from ..scan.outliers import neighbour_distance, one_a_cell
+from ..scan.outliers import first_of_each, neighbour_distance, one_a_cell
 from ..scan.scan import Scan, ScanError
 from ..scan.slices import contour_spacing
 from .mesh_topology import component_labels
@@ -63,7 +63,7 @@ def clean(scan: Scan) -> Cloud:
         used &= np.bincount(scan.faces.ravel(), minlength=len(points)) > 0
         given = normals_of_faces(points, scan.faces) if given is None else given
     rows = np.flatnonzero(used)
-    rows = rows[np.sort(np.unique(points[rows], axis=0, return_index=True)[1])]  # what was written twice counts once
+    rows = rows[first_of_each(points[rows])]
     if len(rows) > _AT_MOST:
         rows = np.sort(np.random.default_rng(0).choice(rows, _AT_MOST, replace=False))
     _check_extent(points[rows])

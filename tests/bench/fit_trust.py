@@ -339,25 +339,12 @@ def sparse(shared: Path) -> Situation:
     return Situation(fitting.Scan(points), mesh, {"levels": 2}, _femur()[0])
 
 
+# Seeds of each case of the protocol; the last five are bad starts.
+PROTOCOL = {"base": 2, "outliers-40": 1, "outliers-60": 1, "sigma-2": 1, "points-5k": 1, "hole-80": 1}
+PROTOCOL |= {"rotation-30": 6, "warp-12": 6, "scale-0.8": 3, "scale-1.2": 3, "bad-start": 13}
 SITUATIONS: dict[str, Callable[[Path], Situation]] = {
     **{f"real: {name}": _real(name) for name in fit_real.CASES if not name.endswith("still")},
-    **{f"protocol: base {seed}": _protocol("base", seed) for seed in (0, 1)},
-    **{
-        f"protocol: {case} {seed}": _protocol(case, seed)
-        for case in (
-            "outliers-40",
-            "outliers-60",
-            "sigma-2",
-            "points-5k",
-            "hole-80",
-            "rotation-30",
-            "scale-0.8",
-            "scale-1.2",
-            "warp-12",
-        )
-        for seed in (0,)
-    },
-    **{f"protocol: bad-start {seed}": _protocol("bad-start", seed) for seed in range(4)},
+    **{f"protocol: {case} {seed}": _protocol(case, seed) for case, seeds in PROTOCOL.items() for seed in range(seeds)},
     "bone and table, no template": _tibia("tibia_table.xyz"),
     "two bones, no template": _tibia("tibia_two.xyz"),
     "bone in slices 5 mm apart, no template": _tibia("tibia_slices5.xyz"),
