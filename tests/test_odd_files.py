@@ -463,6 +463,7 @@ def test_topologies_with_parts_of_other_kinds(tmp_path, change, words):
         "[" * 5000,
         '{"scheme": {"name": "Loop"}, "levels": %s}' % ("9" * 5000),
         '{"scheme": {"name": ["Loop"]}, "levels": 2}',
+        '{"scheme": {"name": "Loop"}, "levels": 2, "priors": {"bend": "%s"}}' % ("9" * 5000),
         '{"scheme": {"name": "Loop"}, "levels": 2, "tolerance": %s}' % ("9" * 400),
         '{"scheme": {"name": "Loop"}, "levels": 2, "priors": {"bend": %s}}' % ("9" * 400),
         '{"scheme": {"name": "Loop"}, "levels": 2, "free": {"vertices": {"a": [1, [2]]}}}',
