@@ -9,6 +9,8 @@ from jaxtyping import Array, Float
 
 def strong_float(value: Any) -> Float[Array, "..."]:
     """`value` as a floating point array of a definite type: a weak one would compile everything once more."""
+    if isinstance(value, str):  # JAX would look for a type of this name
+        raise TypeError(f"numbers are needed; got the text {value[:40]!r}.")
     array = jnp.asarray(value)
     weak = array.weak_type or not jnp.issubdtype(array.dtype, jnp.floating)
     return jnp.asarray(array, jnp.result_type(float) if weak else array.dtype)

@@ -1,6 +1,7 @@
 """Arrays from `.npz` and `.npy` files: read only where their own headers say what the file has room for."""
 
 import math
+import sys
 import warnings
 import zipfile
 from collections.abc import Callable
@@ -86,6 +87,8 @@ def _read_array(stream: Any, size: int, kinds: str) -> np.ndarray:
     array = np.frombuffer(bytearray(stream.read(n_bytes)), dtype)  # of a bytearray, so that it can be written to
     if array.nbytes != n_bytes or stream.read(1):
         raise ValueError("it ends before its last number. The file is cut off")
+    if dtype.kind == "U" and array.size and array.view(f"{dtype.byteorder}u4").max() > sys.maxunicode:
+        raise ValueError("it holds what is no text. The file is damaged")
     return array.reshape(shape, order="F" if by_columns else "C")
 
 

@@ -13,12 +13,12 @@ from jaxtyping import Float
 from .errors import MeshError, name_rows
 
 _DELIMITERS = (";", "\t", ",", " ")  # a blank stands for any white space
-_HEADING = 10_000  # characters of a heading at most
-_SAMPLE = 20  # records from which the delimiter is found
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?(inf|infinity|nan)", re.ASCII | re.IGNORECASE)
+_HEADING = 2_000  # characters of a heading at most
+_SAMPLE, _BEGIN = 20, 1 << 20  # records from which the delimiter is found, and characters that may hold them
+_NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|[+-]?(inf|infinity|nan)", re.ASCII | re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 _MISSING = {"", "-", "na", "n/a", "null", "none", "-nan(ind)", "nan(ind)", "1.#qnan", "-1.#ind", "1.#inf", "-1.#inf"}
-_UNIT = re.compile(r"\s*[(\[][^)\]]*[)\]]")
+_UNIT = re.compile(r"[(\[][^)\]]*[)\]]")
 _COMMENTS = ("#", "//")
 _POINT = "Write decimals with a point."
 
@@ -102,7 +102,7 @@ def read_table(path: Path) -> Table:
         MeshError: the file holds no such table; the text names it and the line.
     """
     text = decode(path.read_bytes())
-    delimiter = _find_delimiter(path, text)
+    delimiter = _find_delimiter(path, text[:_BEGIN])
     records = list(_records(path, text, delimiter))
     count = _leading_count(records)
     records = records[count is not None :]
@@ -115,9 +115,9 @@ def read_table(path: Path) -> Table:
     else:
         headings = _commented_headings(text, line, delimiter, len(first))
     if headings and records and delimiter == " " and len(headings) != len(records[0][1]):
-        headings = _headings(_UNIT.sub("", " ".join(first)).split())
+        headings = _headings(_UNIT.sub("", " ".join(first)[:_HEADING]).split())
     rows, lines = [cells for _, cells in records], [number for number, _ in records]
-    _check_columns(path, rows, lines, len(headings or first), delimiter)
+    _even_columns(path, rows, lines, len(headings or first), delimiter)
     if count is not None and count != len(rows):
         raise MeshError(
             f"{path.name}: the first row announces {count} rows, but {len(rows)} follow. The file is cut off, or the "
@@ -161,9 +161,10 @@ def _without_comment(line: str, delimiter: str) -> str:
     if begin.startswith(_COMMENTS) or (begin[:1] == ";" and (delimiter != ";" or begin[1:2].isspace())):
         return ""
     if "#" in line:
-        at = -1
+        at, before, n_quotes = -1, 0, 0
         while (at := line.find("#", at + 1)) >= 0:
-            if line.count('"', 0, at) % 2 == 0 and line[at - 1] not in ",;":
+            n_quotes, before = n_quotes + line.count('"', before, at), at
+            if n_quotes % 2 == 0 and line[at - 1] not in ",;":
                 line = line[:at]
                 break
     return line.replace("\t", " ") if delimiter == " " else line
@@ -178,7 +179,7 @@ def _find_delimiter(path: Path, text: str) -> str:
             continue
         body = records[_leading_count(records) is not None :]
         if body and _n_numbers(body[0][1], delimiter) < 3:
-            heading = _UNIT.sub("", " ".join(body[0][1])).split() if delimiter == " " else body[0][1]
+            heading = _UNIT.sub("", " ".join(body[0][1])[:_HEADING]).split() if delimiter == " " else body[0][1]
             body = [(0, heading), *body[1:]] if len(body) > 1 and len(body[1][1]) != len(body[0][1]) else body
         if len({len(cells) for _, cells in body}) == 1 and _n_numbers(body[-1][1], delimiter) >= 3:
             return delimiter
@@ -199,7 +200,7 @@ def _n_numbers(cells: list[str], delimiter: str) -> int:
 
 
 def _headings(cells: list[str]) -> list[str]:
-    return [_UNIT.sub("", cell).strip().lower() or cell.strip().lower() for cell in cells]
+    return [_UNIT.sub("", cell[:_HEADING]).strip().lower() or cell.strip().lower() for cell in cells]
 
 
 def _commented_headings(text: str, line: int, delimiter: str, n_columns: int) -> list[str]:
@@ -211,10 +212,13 @@ def _commented_headings(text: str, line: int, delimiter: str, n_columns: int) ->
     return cells if len(cells) == n_columns and {"x", "y", "z"} <= set(cells) else []
 
 
-def _check_columns(path: Path, rows: list[list[str]], lines: list[int], n_columns: int, delimiter: str) -> None:
+def _even_columns(path: Path, rows: list[list[str]], lines: list[int], n_columns: int, delimiter: str) -> None:
+    """Leave out empty cells past the last column; raise where a row has more or fewer than the first."""
     if set(map(len, rows)) <= {n_columns}:
         return
     for cells, line in zip(rows, lines, strict=True):
+        while len(cells) > n_columns and not cells[-1]:
+            cells.pop()  # of a delimiter at the end of the line
         if len(cells) != n_columns:
             halves = f" {_POINT}" if delimiter == "," and len(cells) == 2 * n_columns else ""
             raise MeshError(

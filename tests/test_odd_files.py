@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import time
 import warnings
 import zipfile
 from pathlib import Path
@@ -75,6 +76,31 @@ def test_normals_are_found_by_their_length_wherever_they_stand(tmp_path):
 def test_text_without_a_heading_is_left_out(tmp_path):
     with pytest.warns(UserWarning, match="column 4 left out"):
         assert len(read_points(put(tmp_path, "a.csv", "1,2,3,skin\n4,5,6,bone\n")).points) == 2
+
+
+def test_delimiters_at_the_ends_of_lines_make_no_column(tmp_path):
+    np.testing.assert_array_equal(
+        read_points(put(tmp_path, "a.csv", "x,y,z\n1,2,3,\n4,5,6,,\n")).points, [(1, 2, 3), (4, 5, 6)]
+    )
+
+
+LONG = {
+    "a.csv": "1" * 131000 + "x,2,3\n1,2,3\n",
+    "b.csv": "(" * 131000 + ",2,3\n1,2,3\n",
+    "c.csv": "1,2,3," + ",#" * 300_000 + "\n1,2,3\n",
+    "d.csv": '"' * 1_000_001 + "\n1,2,3\n",
+    "a.vtp": "<AppendedData" * 100_000,
+    "a.obj": "\\\n" * 300_000,
+}
+
+
+@pytest.mark.parametrize("name", LONG)
+def test_long_lines_take_no_time(tmp_path, name):
+    """Each of these took minutes to split where the time grew as the square of the length."""
+    begin = time.monotonic()
+    with pytest.raises(MeshError) as error:
+        read_points(put(tmp_path, name, LONG[name]))
+    assert time.monotonic() - begin < 20 and len(str(error.value)) < 1000
 
 
 def test_whole_numbers_with_a_sign_are_no_halves_of_decimal_commas(tmp_path):
@@ -437,6 +463,7 @@ def test_topologies_with_parts_of_other_kinds(tmp_path, change, words):
         "[" * 5000,
         '{"scheme": {"name": "Loop"}, "levels": %s}' % ("9" * 5000),
         '{"scheme": {"name": ["Loop"]}, "levels": 2}',
+        '{"scheme": {"name": "Loop"}, "levels": 2, "priors": {"bend": "%s"}}' % ("9" * 5000),
         '{"scheme": {"name": "Loop"}, "levels": 2, "tolerance": %s}' % ("9" * 400),
         '{"scheme": {"name": "Loop"}, "levels": 2, "priors": {"bend": %s}}' % ("9" * 400),
         '{"scheme": {"name": "Loop"}, "levels": 2, "free": {"vertices": {"a": [1, [2]]}}}',

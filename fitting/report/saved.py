@@ -135,7 +135,7 @@ def load_fit(folder: str | os.PathLike[str]) -> tuple[Fit, str]:
             return _restore(arrays), recipe
     except KeyError as error:
         raise ValueError(f"{path}: {error.args[0]!r} is missing: the file is not one of a saved fit.") from None
-    except (ValueError, TypeError, IndexError, AttributeError, AssertionError, OverflowError) as error:
+    except (ValueError, TypeError, IndexError, AttributeError, AssertionError, OverflowError, RecursionError) as error:
         # Arrays of other shapes than a fit has stop its mathematics in as many ways.
         raise ValueError(f"{path}: {error}") from None
 

@@ -56,7 +56,7 @@ def load_recipe(path: str | os.PathLike[str]) -> Recipe:
     """
     try:
         return Recipe.from_json(Path(path).read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: {error}") from None
 
 

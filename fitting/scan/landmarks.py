@@ -1,6 +1,7 @@
 """Landmarks: the same few places named on the scan and on the template."""
 
 import json
+import reprlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -60,7 +61,9 @@ def read_landmarks(path: str | Path, *, scale: float = 1.0) -> dict[str, Float[n
         for name, where, values in readers[path.suffix.lower()](path):
             position = np.array(values, np.float64) * scale if _are_three_numbers(values) else np.full(3, np.nan)
             if not np.isfinite(position).all():
-                raise ScanError(f"{path}, {where}: a landmark is three finite numbers x, y, z; got {str(values)[:80]}.")
+                raise ScanError(
+                    f"{path}, {where}: a landmark is three finite numbers x, y, z; got {reprlib.repr(values)}."
+                )
             if name in landmarks:
                 raise ScanError(f"{path}, {where}: a landmark of the name '{name}' came before. Names must differ.")
             landmarks[name] = position

@@ -330,5 +330,6 @@ def _finite_rows(array: np.ndarray) -> Bool[np.ndarray, "n"]:
 
 
 def _scaled(array: np.ndarray, scale: float | int) -> np.ndarray:
-    with np.errstate(over="ignore"):  # what passes the largest number is not finite, and told as such
+    # What passes the largest number is not finite, and told as such; NaN of some makes warn of any arithmetic.
+    with np.errstate(over="ignore", invalid="ignore"):
         return array * scale

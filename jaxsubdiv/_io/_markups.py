@@ -2,6 +2,7 @@
 
 import json
 import re
+import reprlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,7 +53,7 @@ def _read_json(path: Path) -> _Marks:
             raise MeshError(f"{path.name}: the list `markups` must hold objects with a list `controlPoints`.")
         unit = markup.get("coordinateUnits", "mm")
         if unit != "mm":
-            warn(path, f"positions are in {str(unit)[:40]}, as the file says; `scale` turns them into mm.")
+            warn(path, f"positions are in {reprlib.repr(unit)}, as the file says; `scale` turns them into mm.")
         for i, point in enumerate(points):
             where = f"control point {i}, counted from zero,"
             if not isinstance(point, dict):
@@ -88,11 +89,11 @@ def _append(path: Path, marks: _Marks, where: str, position: Any, label: Any, fr
         )
     except (TypeError, ValueError, OverflowError):
         raise MeshError(
-            f"{path.name}: {where} needs a `position` of three numbers; got {str(position)[:60]}."
+            f"{path.name}: {where} needs a `position` of three numbers; got {reprlib.repr(position)}."
         ) from None
-    known = _FRAMES.get(str(frame).lower())
+    known = _FRAMES.get(str(frame).lower()) if isinstance(frame, (str, int)) else None
     if known is None:
-        raise MeshError(f"{path.name}: the frame '{str(frame)[:40]}' is not known; it must be LPS or RAS.")
+        raise MeshError(f"{path.name}: the frame {reprlib.repr(frame)} is not known; it must be LPS or RAS.")
     marks.positions.append([x, y, z])
-    marks.labels.append("" if label is None else str(label))
+    marks.labels.append(label if isinstance(label, str) else "")
     marks.frames.append(known)

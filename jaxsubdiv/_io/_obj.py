@@ -123,18 +123,18 @@ def _logical_lines(text: str) -> _Lines:
     numbers = np.arange(1, len(lines) + 1)
     if "\\" not in text:
         return _Lines(lines, numbers)
-    joined: list[str] = []
+    joined: list[list[str]] = []
     begins: list[int] = []
     continues = False
     for number, line in zip(numbers.tolist(), lines, strict=True):
         part = line.removesuffix("\\")
         if continues:
-            joined[-1] += " " + part
+            joined[-1].append(part)
         else:
-            joined.append(part)
+            joined.append([part])
             begins.append(number)
         continues = line.endswith("\\")
-    return _Lines(joined, np.array(begins))
+    return _Lines([" ".join(parts) for parts in joined], np.array(begins))
 
 
 def _triples(path: Path, lines: _Lines, at: Int[np.ndarray, "s"], key: str) -> Float[np.ndarray, "s 3"]:

@@ -15,7 +15,7 @@ _WORDS = "|".join(("points?", "positions?", "pos", "coordinates?", "coords?"))
 _AXIS = r"[ _:.-]?([xyz012])"
 _ALIASES = (
     (re.compile(f"(?:{_WORDS}){_AXIS}"), ""),
-    (re.compile(rf"([xyz])(?:[ _-]?(?:{_WORDS})|_(?:mm|cm|m|in))"), ""),
+    (re.compile(rf"([xyz])(?:[ _-]?(?:{_WORDS})|[ _](?:mm|cm|m|in))"), ""),
     (re.compile(f"(?:normals?|norm|n){_AXIS}"), "n"),
     (re.compile(r"(weight)s?"), ""),
     (re.compile(r"(label|contour)[ _-](?:type|name)"), ""),
@@ -41,7 +41,8 @@ def _by_headings(path: Path, table: Table) -> Contents:
     if not set(_POSITION) <= set(known) or n_normal not in (0, 3) or len(set(known)) < len(known):
         raise MeshError(
             f"{path.name}, line {table.line}: a header row must name x, y and z, all of nx, ny, nz or none, and none "
-            f"twice; this one has {name_rows(table.headings, 8)}. Columns of other names are left out."
+            f"twice; this one has {name_rows((name[:40] for name in table.headings), 8)}. Columns of other "
+            "names are left out."
         )
     texts = {name: table.texts(place) for place, name in enumerate(names) if name not in known}
     place = {name: names.index(name) for name in known}

@@ -4,6 +4,7 @@ Not read by VTK: counts that a file only announces end the interpreter there.
 """
 
 import re
+from bisect import bisect_right
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
@@ -22,7 +23,8 @@ _TYPES = {
     "Float32": "f4",
     "Float64": "f8",
 }
-_APPENDED = re.compile(rb"<AppendedData[^>]*>\s*_")
+_APPENDED = re.compile(rb"<AppendedData[^>]{0,200}>\s{0,200}_")
+_COUNT = re.compile("[0-9]{1,18}")
 _PACKERS = {None: None, "vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
 
 
@@ -33,6 +35,8 @@ class _File(NamedTuple):
     """What follows the underscore of the appended data."""
     is_raw: bool
     """Whether the appended data are bytes, not base64."""
+    offsets: list[int]
+    """Where arrays begin in the appended data, and where these end, ascending."""
 
 
 def read(path: Path) -> Contents:
@@ -71,7 +75,9 @@ def _open(path: Path) -> _File:
             f"{path.name}: it holds a {str(root.get('type'))[:40]}, not polygons. Take its surface first: "
             "pyvista.read(...).extract_surface().save(...)."
         )
-    return _File(path, root, appended, is_raw)
+    found = [array.get("offset", "") for array in root.iter("DataArray")]
+    offsets = sorted({int(offset) for offset in found if _COUNT.fullmatch(offset)} | {len(appended)})
+    return _File(path, root, appended, is_raw, offsets)
 
 
 def _pieces(file: _File) -> list[Element]:
@@ -117,7 +123,7 @@ def _join(parts: list[Contents]) -> Contents:
 
 def _count(file: _File, piece: Element, name: str) -> int:
     text = piece.get(name, "0").strip()
-    if not re.fullmatch("[0-9]{1,18}", text):
+    if not _COUNT.fullmatch(text):
         raise MeshError(f"{file.path.name}: '{name}' is '{text[:40]}', which is no count. The file is damaged.")
     return int(text)
 
@@ -152,11 +158,12 @@ def _bytes(file: _File, array: Element, form: str) -> bytes:
         raise ValueError(f"it is packed by {packer}. Save it with zlib, by VTK's SetCompressorTypeToZLib")
     if form == "appended":
         offset = array.get("offset", "")
-        if not re.fullmatch("[0-9]{1,18}", offset) or int(offset) > len(file.appended):
+        if not _COUNT.fullmatch(offset) or int(offset) >= len(file.appended):
             raise ValueError(f"the offset '{offset[:40]}' lies outside of the appended data")
-        data = file.appended[int(offset) :]
+        end = file.offsets[bisect_right(file.offsets, int(offset))]  # where the next array begins
+        data = file.appended[int(offset) : end]
         if not file.is_raw:
-            data = _xml.from_base64(data[: _end(file, int(offset)) - int(offset)].decode("ascii", errors="replace"))
+            data = _xml.from_base64(data.decode("ascii", errors="replace"))
     else:
         data = _xml.from_base64(array.text or "")
     header = np.dtype(
@@ -176,14 +183,6 @@ def _bytes(file: _File, array: Element, form: str) -> bytes:
         blocks.append(_xml.unpack(data[at : at + size], n_bytes, str(_PACKERS[packer])))
         at += size
     return b"".join(blocks)
-
-
-def _end(file: _File, offset: int) -> int:
-    """Where the next array of the appended data begins, which is where this one ends in base64."""
-    offsets = [array.get("offset", "") for array in file.root.iter("DataArray")]
-    return min(
-        (int(o) for o in offsets if re.fullmatch("[0-9]{1,18}", o) and int(o) > offset), default=len(file.appended)
-    )
 
 
 def _counts(data: bytes, header: np.dtype, first: int, n: int) -> list[int]:
