@@ -196,6 +196,7 @@ def _fit(scan: Path | None, folder: Path, options: argparse.Namespace, recipe: R
     done = _done(folder, marks) if options.resume else None
     if done is not None:
         print(f"done     before, in {folder}")
+        _print_warnings(done)
         return _row(title, done, misfit(done), None)
     if job.mesh is not None:
         print(f"control  {len(job.mesh.vertices):,} vertices, {job.mesh.n_faces:,} faces, {_size(job.mesh.vertices)}")
@@ -215,9 +216,13 @@ def _fit(scan: Path | None, folder: Path, options: argparse.Namespace, recipe: R
     report, off = found.result.report(uncertainty=True), misfit(found.result)
     print(f"done     in {seconds:.1f} s{_ending(found, off)}\n\n{dataclasses.replace(report, warnings=[])}\n")
     _save(folder, found, title, marks)
-    for finding in report.warnings:
-        print(in_colour(f"WARNING  {finding.text}"))
+    _print_warnings(found.result)
     return _row(title, found.result, off, seconds)
+
+
+def _print_warnings(result: FitResult) -> None:
+    for finding in result.warnings:
+        print(in_colour(f"WARNING  {finding.text}"))
 
 
 def _row(name: str, result: FitResult, off: float, seconds: float | None) -> dict:

@@ -17,8 +17,8 @@ import jaxsubdiv as js
 from fitting import Scan
 from fitting.__main__ import main
 from fitting.finding import Finding, Origin, Pose
-from fitting.report.evidence import own_noise, share_of_two_walls
-from fitting.report.findings import CHECKS, Evidence, check_jumps, check_noise, gather_evidence
+from fitting.report.evidence import Evidence, find_two_walls, gather_evidence, own_noise
+from fitting.report.findings import CHECKS, check_jumps, check_noise
 from fitting.report.record import Fit
 from fitting.start.align import mirror_image, sample_faces
 
@@ -94,7 +94,8 @@ def test_one_wall_is_not_two(spread):
     rng = np.random.default_rng(0)
     feet = np.append(rng.uniform(0, 100, (4000, 2)), np.zeros((4000, 1)), axis=1)
     up, draw = np.tile([0.0, 0, 1], (4000, 1)), getattr(rng, spread)
-    assert share_of_two_walls(feet, up, draw(size=4000)) < 0.15
+    assert find_two_walls(feet, up, draw(size=4000))[0] < 0.15
+    assert find_two_walls(feet, up, np.zeros(4000), 1e-9)[0] == 0
 
 
 def test_normals_that_face_against():
@@ -109,6 +110,8 @@ def test_normals_that_face_against():
     found = problem().fit(scan=Scan(problem().points, normals))
     finding = next(one for one in found.warnings if one.name == "points_face_against")
     assert finding.numbers["share"] == pytest.approx(0.25, abs=0.02)
+    ignored = np.where(np.arange(N_POINTS) % 4, 1.0, 0.0)
+    assert names(problem().fit(scan=Scan(problem().points, normals, ignored))) == []
 
 
 def test_distances_that_jump():
@@ -140,8 +143,9 @@ def test_own_noise_is_that_of_points_about_their_planes():
     for points in (flat, apart):
         own = own_noise(points, np.ones(len(points), bool))
         assert own.noise == pytest.approx(0.3, rel=0.1)
-        assert own.spacing == pytest.approx(0.75, rel=0.1)
-    assert own_noise(flat[:1], np.ones(1, bool)).noise == 0
+    assert np.isnan(own_noise(flat[:1], np.ones(1, bool)).noise)
+    lines = np.append(np.linspace(0, 100, 3000)[:, None], np.tile([[0, 0], [9, 0], [0, 9]], (1000, 1)), axis=1)
+    assert np.isnan(own_noise(lines + rng.normal(scale=0.01, size=(3000, 3)), np.ones(3000, bool)).noise)
 
 
 def test_every_check_is_told_once():
@@ -313,7 +317,8 @@ def test_dense_contours_are_the_whole_bone():
 def test_the_command_tells_last_what_it_left_out(tmp_path, capsys):
     np.savetxt(tmp_path / "two.xyz", np.asarray(two_objects().points))
     words = [str(tmp_path / "two.xyz"), "--faces", "30", "--levels", "1", "-o", str(tmp_path / "out")]
-    assert main(words) == 1
+    with pytest.warns(UserWarning, match="the scan shows 2 parts"):
+        assert main(words) == 1
     text = capsys.readouterr().out
     assert "NOT TO BE TRUSTED" in text
     assert text.splitlines()[-1].startswith("WARNING  the scan shows 2 parts")

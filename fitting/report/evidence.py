@@ -6,10 +6,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
+import jaxsubdiv as js
+
 from ..scan.closest_points import nearest_rows
 from ..scan.outliers import first_of_each
-from ..start.cloud import rows_on_surfaces
+from ..start.cloud import on_lines, rows_on_surfaces
 from ..start.orient import plane_fits
+from .coverage import at_pairs, unit
+from .record import Fit
 
 _MOST = 20_000  # points that are looked at: an even part of more tells as much
 _NEIGHBOURS = 12
@@ -28,13 +32,11 @@ class OwnNoise(NamedTuple):
     """Points that were looked at: those that count, and are not scattered."""
     noise: float
     """Median distance in mm of a point's twelve neighbours from their plane: the noise, or more where they lie so
-    thinly that the surface is not flat between them."""
-    spacing: float
-    """Median distance in mm to the nearest other point."""
+    thinly that the surface is not flat between them. NaN where neighbours lie along lines, or are too few."""
 
 
 def own_noise(points: Float[np.ndarray, "p 3"], counted: Bool[np.ndarray, "p"]) -> OwnNoise:
-    """Noise and spacing of the points that are not scattered, each repeated point once.
+    """Noise of the points that are not scattered, each repeated point once.
 
     Args:
         points: in mm.
@@ -49,11 +51,10 @@ def own_noise(points: Float[np.ndarray, "p 3"], counted: Bool[np.ndarray, "p"]) 
         rows = rows[rows_on_surfaces(points[rows])]
     sampled[rows] = True
     some = points[rows]
-    if len(rows) < 2:
-        return OwnNoise(sampled, 0.0, 0.0)
+    if len(rows) <= 2 * _NEIGHBOURS or on_lines(some):
+        return OwnNoise(sampled, np.nan)
     _, off, _ = plane_fits(some, _NEIGHBOURS)
-    spacing = nearest_rows(KDTree(some), some, 2)[0][:, 1]
-    return OwnNoise(sampled, float(np.median(off)) / _LEFT**0.5, float(np.median(spacing)))
+    return OwnNoise(sampled, float(np.median(off)) / _LEFT**0.5)
 
 
 def among_their_own(points: Float[np.ndarray, "p 3"], chosen: Bool[np.ndarray, "p"]) -> Bool[np.ndarray, "p"]:
@@ -65,22 +66,72 @@ def among_their_own(points: Float[np.ndarray, "p 3"], chosen: Bool[np.ndarray, "
     return own
 
 
-def share_of_two_walls(
-    feet: Float[np.ndarray, "p 3"], sides: Float[np.ndarray, "p 3"], distances: Float[np.ndarray, "p"]
-) -> float:
-    """Share of the patches of the surface whose distances have two humps, with hardly a point between them.
+def find_two_walls(
+    feet: Float[np.ndarray, "p 3"],
+    sides: Float[np.ndarray, "p 3"],
+    distances: Float[np.ndarray, "p"],
+    least: float = 0.0,
+) -> tuple[float, float]:
+    """Share of the patches of the surface whose distances have two humps, with hardly a point between them, and how far
+    these are apart in mm.
 
     Args:
         feet: where on the surface each point is paired, in mm.
         sides: the surface's unit normals there.
         distances: signed, in mm.
+        least: standard deviation in mm of distances that are no more than rounding.
     """
     if len(feet) < _LEAST_PATCHED:
-        return 0.0
+        return 0.0, 0.0
     centres = np.arange(0, len(feet), max(1, len(feet) // 1000))
     _, near = nearest_rows(KDTree(feet), feet[centres], _PATCH)
     same = np.einsum("cpx,cx->cp", sides[near], sides[centres]) > 0.5
     of_patch = distances[near] - distances[near].mean(axis=1, keepdims=True)
-    square = of_patch**2
-    kurtosis = np.mean(square**2, axis=1) / np.maximum(square.mean(axis=1) ** 2, np.finfo(float).tiny)
-    return float(np.mean((kurtosis < _TWO_HUMPS) & (same.mean(axis=1) > 0.8)))
+    variance = np.mean(of_patch**2, axis=1)
+    kurtosis = np.mean(of_patch**4, axis=1) / np.maximum(variance**2, np.finfo(float).tiny)
+    two = (kurtosis < _TWO_HUMPS) & (same.mean(axis=1) > 0.8) & (variance > least**2)
+    return float(two.mean()), float(2 * np.sqrt(np.median(variance[two]))) if two.any() else 0.0
+
+
+class Evidence(NamedTuple):
+    """What the checks look at; lengths in mm."""
+
+    fit: Fit
+    surface: js.RefinedSurface
+    own: OwnNoise
+    edge: float
+    """Length of a control edge, in the middle."""
+    noise: float
+    distances: Float[np.ndarray, "p"]
+    """Of the scan's points, signed."""
+    inliers: Bool[np.ndarray, "p"]
+    feet: Float[np.ndarray, "p 3"]
+    """Where on the surface each point is paired."""
+    sides: Float[np.ndarray, "p 3"]
+    """The surface's unit normals there."""
+    areas: Float[np.ndarray, "v"]
+    """Of the surface's vertices, in mm^2."""
+    covered: Bool[np.ndarray, "v"]
+    """Vertices that the scan covers."""
+
+
+def gather_evidence(
+    fit: Fit, surface: js.RefinedSurface, areas: Float[np.ndarray, "v"], covered: Bool[np.ndarray, "v"]
+) -> Evidence:
+    """All that the checks look at."""
+    look, scattered = fit.look, np.asarray(fit.scene.around.scattered)
+    counted = (np.asarray(fit.scene.scan.weights_or_ones()) > 0) & ~scattered
+    noise, distances = float(look.noise), np.asarray(look.distances, np.float64)
+    return Evidence(
+        fit=fit,
+        surface=surface,
+        own=own_noise(np.asarray(look.pairs.points, np.float64), counted),
+        edge=float(js.edge_length(fit.topology, fit.y.control.vertices)),
+        noise=noise,
+        distances=distances,
+        inliers=np.abs(distances) <= 3 * noise,
+        feet=at_pairs(np.asarray(surface.vertices, np.float64), look),
+        sides=unit(at_pairs(np.asarray(surface.normals, np.float64), look)),
+        areas=areas,
+        covered=covered,
+    )

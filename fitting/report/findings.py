@@ -1,71 +1,22 @@
 """What speaks against a fit. A check is one function and its place in `CHECKS`."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 import optimistix as optx
-from jaxtyping import Bool, Float
-
-import jaxsubdiv as js
+from jaxtyping import Float
 
 from ..finding import Finding
-from .coverage import at_pairs, unit
-from .evidence import OwnNoise, among_their_own, own_noise, share_of_two_walls
-from .record import Fit
+from .coverage import unit
+from .evidence import Evidence, among_their_own, find_two_walls
 
 # Each limit lies between the fits that are wrong and those that are right of tests/bench/fit_trust.py.
 _NOISE_OVER_OWN, _NOISE_OVER_EDGE = 3.0, 0.12
 _UNEXPLAINED_FAR, _FAR, _UNEXPLAINED = 0.03, 0.1, 0.08  # far: in control edges
 _UNSUPPORTED = 0.5
-_TWO_WALLS = 0.15
+_TWO_WALLS, _ROUNDING = 0.15, 1e-4  # of a control edge
 _AGAINST, _FACING = 0.05, -0.5
 _JUMP, _LAST = 1.2, 7
-_FOLDED = -0.2
-
-
-class Evidence(NamedTuple):
-    """What the checks look at; lengths in mm."""
-
-    fit: Fit
-    surface: js.RefinedSurface
-    own: OwnNoise
-    edge: float
-    """Length of a control edge, in the middle."""
-    noise: float
-    distances: Float[np.ndarray, "p"]
-    """Of the scan's points, signed."""
-    inliers: Bool[np.ndarray, "p"]
-    feet: Float[np.ndarray, "p 3"]
-    """Where on the surface each point is paired."""
-    sides: Float[np.ndarray, "p 3"]
-    """The surface's unit normals there."""
-    areas: Float[np.ndarray, "v"]
-    """Of the surface's vertices, in mm^2."""
-    covered: Bool[np.ndarray, "v"]
-    """Vertices that the scan covers."""
-
-
-def gather_evidence(
-    fit: Fit, surface: js.RefinedSurface, areas: Float[np.ndarray, "v"], covered: Bool[np.ndarray, "v"]
-) -> Evidence:
-    """All that the checks look at."""
-    look, scattered = fit.look, np.asarray(fit.scene.around.scattered)
-    counted = (np.asarray(fit.scene.scan.weights_or_ones()) > 0) & ~scattered
-    noise, distances = float(look.noise), np.asarray(look.distances, np.float64)
-    return Evidence(
-        fit=fit,
-        surface=surface,
-        own=own_noise(np.asarray(look.pairs.points, np.float64), counted),
-        edge=float(js.edge_length(fit.topology, fit.y.control.vertices)),
-        noise=noise,
-        distances=distances,
-        inliers=np.abs(distances) <= 3 * noise,
-        feet=at_pairs(np.asarray(surface.vertices, np.float64), look),
-        sides=unit(at_pairs(np.asarray(surface.normals, np.float64), look)),
-        areas=areas,
-        covered=covered,
-    )
 
 
 def find_what_speaks_against(seen: Evidence) -> list[Finding]:
@@ -89,7 +40,7 @@ def check_convergence(seen: Evidence) -> Finding | None:
 def check_noise(seen: Evidence) -> Finding | None:
     """Whether the distances are noise of the scan, or a surface that is wrong."""
     over_own, over_edge = seen.noise / max(seen.own.noise, 1e-9 * seen.edge), seen.noise / seen.edge
-    if over_own < _NOISE_OVER_OWN or over_edge < _NOISE_OVER_EDGE:
+    if np.isnan(over_own) or over_own < _NOISE_OVER_OWN or over_edge < _NOISE_OVER_EDGE:
         return None
     return Finding(
         "noise_above_the_scans_own",
@@ -138,14 +89,14 @@ def check_unsupported_surface(seen: Evidence) -> Finding | None:
 def check_two_walls(seen: Evidence) -> Finding | None:
     """Whether the surface lies between two layers of points."""
     kept = seen.inliers & seen.own.sampled
-    share = share_of_two_walls(seen.feet[kept], seen.sides[kept], seen.distances[kept])
+    share, apart = find_two_walls(seen.feet[kept], seen.sides[kept], seen.distances[kept], _ROUNDING * seen.edge)
     if share < _TWO_WALLS:
         return None
     return Finding(
         "two_walls",
-        f"on {share:.0%} of the surface the points lie in two layers, {2 * seen.noise:.3g} mm apart, and the surface "
+        f"on {share:.0%} of the surface the points lie in two layers, {apart:.3g} mm apart, and the surface "
         "between them. Keep one of the walls, by labels or normals.",
-        {"share": share, "apart": 2 * seen.noise},
+        {"share": share, "apart": apart},
     )
 
 
@@ -155,7 +106,7 @@ def check_facing(seen: Evidence) -> Finding | None:
     if normals is None:
         return None
     own = np.asarray(normals, np.float64)
-    there = seen.inliers & (own != 0).any(axis=1)
+    there = seen.inliers & seen.own.sampled & (own != 0).any(axis=1)
     if not there.any():
         return None
     cosine = np.einsum("px,px->p", unit(own[there]), seen.sides[there])
@@ -179,8 +130,8 @@ def check_jumps(seen: Evidence) -> Finding | None:
         return None
     return Finding(
         "distances_jump",
-        f"the RMS distance rose in {len(rises)} of the last {len(last)} sweeps, by up to {rises.max() - 1:.0%}: the "
-        "surface goes to and fro. Give a better start, or fewer faces.",
+        f"the RMS distance of the points that count rose in {len(rises)} of the last {len(last) - 1} sweeps, by up to "
+        f"{rises.max() - 1:.0%}: the surface goes to and fro. Give a better start, or fewer faces.",
         {"rises": len(rises), "largest": float(rises.max())},
     )
 

@@ -18,7 +18,8 @@ from ..model.pairing import make_scene
 from ..model.recipe import Settings
 from ..scan.scan import Scan
 from .coverage import distances_to_scan, vertex_areas, weighted_quantile, worst_places
-from .findings import find_what_speaks_against, gather_evidence
+from .evidence import gather_evidence
+from .findings import find_what_speaks_against
 from .posterior import Posterior, Uncertainty
 from .record import Fit, look_at
 from .refit import Refit, make_refit
@@ -148,8 +149,8 @@ class FitResult:
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Write the fit into a folder, made where there is none, for `fitting.load`; and its settings.
 
-        Of the two files `fit.npz` holds everything, scan and control mesh included, and `recipe.json` the settings, for
-        `fitting.load_recipe` and for people. Each is complete or not there.
+        Of the two files `fit.npz` holds everything, control mesh and scan (less its faces) included, and `recipe.json`
+        the settings, for `fitting.load_recipe` and for people. Each is complete or not there.
 
         Raises:
             OSError: the folder cannot be made or written.

@@ -116,8 +116,8 @@ def fit(
             solves where JAX computes; default: "sparse" on the CPU, else the other. Both come to the same surface.
         max_sweeps: how many sweeps at most.
         tolerance: converged once a sweep, annealed, moves nine tenths of the surface, and the RMS distance, by less
-            than this part of the surface's uncertainty, which is about noise / sqrt(points a control vertex); or of a
-            hundredth of a control edge, where that is more.
+            than this part of the surface's uncertainty, which is about noise / sqrt(points a control vertex), or of a
+            hundredth of a control edge, where that is more; and no more than of a tenth of one.
         throw: raise where the fit did not converge, or return the reason in `FitResult.result`.
         on_sweep: called after every sweep, for progress.
         checkpoint: a folder that keeps the state after every sweep in `checkpoint.npz`. Called again with the same

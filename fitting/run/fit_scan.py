@@ -46,7 +46,8 @@ class ScanFit(NamedTuple):
     start: js.ControlMesh
     """Control mesh where the last fit started: aligned, or made from the scan, or split."""
     alignment: Alignment | None
-    """None where the control mesh was made from the scan, or was not to be aligned."""
+    """None where the control mesh was made from the scan, or was not to be aligned. Of the template's mirror image, where
+    that was fitted."""
     splits: int
     """How many times the control mesh was split into four times its faces."""
     outcome: Outcome | None
@@ -114,7 +115,8 @@ def fit_scan(
             partners are found on the template as it is given.
 
     Raises:
-        ValueError: a number is out of its range; the priors ask for likeness, and there is no template to be like.
+        ValueError: a number is out of its range; the priors ask for likeness, or `mirror` for a mirror image, and there
+            is no template; or `mirror` is given without a pose.
         ScanError, ValueError, ImportError, RuntimeError: as `align`, `control_mesh` and `fit` do.
     """
     numbers = {"levels": levels, "faces": faces, "tolerance_mm": tolerance_mm, "most_faces": most_faces}
@@ -147,7 +149,11 @@ def fit_scan(
         before = kept.read()
     if before is not None:
         say("goes on where it was stopped")
-        start = _recalled(before, first, mesh)
+        try:
+            start = _recalled(before, first, mesh)
+        except (KeyError, ValueError, TypeError) as error:
+            where = Path(checkpoint or "") / CHECKPOINT_START
+            raise ValueError(f"{where} is no checkpoint of a start: {error}. Delete it to start anew.") from None
     elif mesh is None:
         say(f"makes a control mesh of about {faces} faces")
         made = make_control_mesh(scan, faces=faces, kind=kind, closed=closed, part=part)

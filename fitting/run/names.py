@@ -78,7 +78,7 @@ def _number(names: list[str]) -> list[str]:
     seen: set[str] = set()
     for name in names:
         if _key(name) in seen or _bad(name):
-            short = os.fsdecode(os.fsencode(name)[:_LONGEST])
+            short = os.fsencode(name)[:_LONGEST].decode("utf-8", "ignore")
             name = next(new for i in count(2) if _key(new := f"{short}-{i}") not in taken)
             taken.add(_key(name))
         seen.add(_key(name))

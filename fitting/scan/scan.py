@@ -45,9 +45,15 @@ def _optional_whole(value: object) -> Array | None:
 
 def _optional_faces(value: object) -> np.ndarray | None:
     faces = None if value is None else np.asarray(value)
-    if faces is not None and (faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu"):
-        raise ScanError(f"`faces` must be triangles, rows of three points [t, 3]; got {list(faces.shape)}.")
-    return None if faces is None or not len(faces) else faces.astype(np.int32)
+    if faces is None or not faces.size:
+        return None
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+        raise ScanError(
+            f"`faces` must be triangles, rows of three whole numbers [t, 3]; got {list(faces.shape)} of {faces.dtype}."
+        )
+    if faces.min() < 0 or faces.max() > np.iinfo(np.int32).max:
+        raise ScanError(f"`faces` name points from 0 on; got {faces.min()} to {faces.max()}.")
+    return faces.astype(np.int32)
 
 
 class Scan(eqx.Module):
@@ -62,12 +68,13 @@ class Scan(eqx.Module):
             counts: how large the noise is, the fit finds out.
         slices: the number of the slice that each point lies in, or None where the scan is not made of slices. `fit`
             shifts each within its plane.
-        faces: triangles between the points `[t, 3]`, or None. A control mesh made from the scan takes its sides from
-            them, its parts, and whether it is closed; `fit` looks at the points alone.
+        faces: triangles between the points `[t, 3]`, or None. A control mesh made from the scan takes from them its
+            parts, and which side is out where there are no normals; `fit` looks at the points alone, and a saved fit
+            does not keep them.
 
     Raises:
         ScanError: there is no point, a value is not finite, a weight is negative, a deviation is not positive, a
-            slice has no whole number, or lengths differ.
+            slice has no whole number, faces are no triangles between the points, or lengths differ.
     """
 
     points: Float[Array, "p 3"] = eqx.field(converter=strong_float)
@@ -127,10 +134,13 @@ class Scan(eqx.Module):
         return weights / jnp.mean(weights, where=weights > 0)
 
     def drawn(self, n: int) -> "Scan":
-        """At most `n` of the points, drawn at random, always the same."""
+        """At most `n` of the points that count, drawn at random, always the same."""
         if n >= self.n_points:
             return self
-        return self.rows(np.sort(np.random.default_rng(0).choice(self.n_points, n, replace=False)))
+        counted = np.arange(self.n_points) if self.weights is None else np.flatnonzero(np.asarray(self.weights) > 0)
+        if n >= len(counted):
+            return self.rows(counted)
+        return self.rows(np.sort(np.random.default_rng(0).choice(counted, n, replace=False)))
 
     def rows(self, chosen: Bool[np.ndarray, "p"] | Int[np.ndarray, "q"]) -> "Scan":
         """Some of the points, with all that is known of each."""

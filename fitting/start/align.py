@@ -163,7 +163,8 @@ def align(
         refine: False ends after the landmarks alone, which must then fix the pose.
 
     Warns:
-        UserWarning: one for each of `doubts`: mirrored, ambiguous, little of the scan used, another unit.
+        UserWarning: one for each of `doubts`: mirrored, ambiguous, little of the scan used, another unit or size,
+            landmarks far from their places.
 
     Raises:
         ScanError: fewer than 10 points, all on a line or one spot; a template without extent; landmarks that do not
@@ -179,6 +180,8 @@ def align(
     placed = None if landmarks is None else place_landmarks(landmarks, mesh)
     doubts: list[Finding] = []
     start = None if placed is None else _landmark_pose(placed, kind)
+    if scan.weights is not None:
+        scan = scan.rows(np.asarray(scan.weights) > 0)  # the others are as if they were not there
     points = _thinned(np.asarray(scan.points, np.float64))
     if not refine:
         if start is None:
@@ -198,6 +201,7 @@ def align(
     best = _best_starts(poses, few, surface, free, keep, placed)
     surface, many = sample_faces(mesh, _FINE[1]), _rows(points, _FINE[0])
     fine = [_search(found.pose, many, surface, free, keep, placed, _FINE_STEPS) for found in best]
+    fine = [one for one in fine if np.isfinite(one.score)] or fine
     near = _near(fine)
     chosen = min(
         fine, key=lambda one: one.near_score(near) * (_CLEARLY if _angle(one.pose.linear) < 2 * _NEARBY else 1)
@@ -485,7 +489,8 @@ def _angle(linear: Float[np.ndarray, "3 3"]) -> float:
 
 def _near(found: list[_Found]) -> float:
     """How far from the best of some poses a point still counts as near."""
-    return _NEAR * min(float(np.quantile(one.distances, _SURE)) for one in found)
+    finite = (float(np.quantile(one.distances, _SURE)) for one in found if np.isfinite(one.score))
+    return _NEAR * min(finite, default=0.0)
 
 
 def _other_answers(chosen: _Found, others: list[_Found], share_of_template: float) -> list[Finding]:
@@ -494,9 +499,11 @@ def _other_answers(chosen: _Found, others: list[_Found], share_of_template: floa
         return []
     # A scan of a part leaves more poses: one that is clearly worse on the whole may be right on another's body.
     alike = _ALIKE if share_of_template > _WHOLE else _ALIKE_IN_PART
+    near = _near([chosen, *others])
     for other in others:
         angle = _angle(other.pose.linear @ np.linalg.inv(chosen.pose.linear))
-        if angle > _FAR_ROTATION and other.score < alike * chosen.score:
+        as_near = other.near_score(near) < alike * chosen.near_score(near)
+        if angle > _FAR_ROTATION and other.score < alike * chosen.score and as_near:
             return [
                 Finding(
                     "two_poses_alike",
@@ -544,7 +551,7 @@ def _finish(
     rms = float(np.sqrt(np.mean(pairs.across[counts] ** 2))) if share else np.inf
     size = _spread(pose, surface)
     found = _in_words(pose, surface, _rows(np.asarray(scan.points, np.float64), _AT_MOST), limit, share)
-    if rms > 0.1 * size:
+    if share and rms > 0.1 * size:
         text = f"the template is {rms:.3g} mm off where it fits best, for a size of {size:.3g} mm."
         doubts.append(Finding("template_off", text, {"rms": rms, "size": size}))
     if share < 0.25:

@@ -155,7 +155,7 @@ def _even_rows(points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, "q"]:
     cell = max(float(np.quantile(reach, 0.1)), 1e-6 * float(np.ptp(points, axis=0).max())) / 2
     for _ in range(_THINNINGS):
         low, high = np.quantile(reach, [0.1, 0.9])
-        if high <= _UNEVEN * low and not _on_lines(points[rows]):
+        if high <= _UNEVEN * low and not on_lines(points[rows]):
             return rows
         thinner = one_a_cell(points, cell)
         if len(thinner) < 10 * LEAST_POINTS:
@@ -165,7 +165,8 @@ def _even_rows(points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, "q"]:
     return rows
 
 
-def _on_lines(points: Float[np.ndarray, "p 3"]) -> bool:
+def on_lines(points: Float[np.ndarray, "p 3"]) -> bool:
+    """Whether most points have their neighbours on a line, as those of contours do."""
     _, near = nearest_rows(KDTree(points), points, min(NEIGHBOUR + 1, len(points)))
     around = points[near] - points[near].mean(axis=1, keepdims=True)
     spread = np.linalg.eigvalsh(np.matmul(around.transpose(0, 2, 1), around))

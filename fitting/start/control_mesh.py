@@ -57,16 +57,14 @@ def control_mesh(
             shares of the points. Or the scan is so small or large that its unit is hardly mm.
 
     Raises:
+        ValueError: `kind` or `part` is none of these, or `faces` below 16.
         ScanError: fewer than 50 points, all on a line or a plane, or no surface in them; contours in slices that lie
-            far apart; faces too few for the topology.
+            far apart; faces too few for the topology, or to reach all of the scan.
         ImportError: the extra `mesh` is missing.
 
     Source: Kazhdan 2006 (Poisson), Hoppe 1992 and Hou 2022 (normals), Valette 2004 (clusters).
     """
-    made = make_control_mesh(scan, faces=faces, kind=kind, closed=closed, part=part)
-    for finding in made.findings:
-        warnings.warn(finding.text, stacklevel=2)
-    return made.mesh
+    return make_control_mesh(scan, faces=faces, kind=kind, closed=closed, part=part).mesh
 
 
 class Made(NamedTuple):
@@ -74,13 +72,13 @@ class Made(NamedTuple):
 
     mesh: js.ControlMesh
     findings: tuple[Finding, ...]
-    """What speaks against it: parts that were left out."""
+    """What speaks against it: parts that were left out, a size of another unit."""
     shown: Bool[np.ndarray, "p"]
     """Points of the scan that do not lie on parts that were left out."""
 
 
 def make_control_mesh(scan: Scan, *, faces: int, kind: FaceKind, closed: bool | None, part: PartKind | None) -> Made:
-    """The same as `control_mesh`, with what was left out."""
+    """The same as `control_mesh`, with what was left out; it warns of the findings."""
     if kind not in get_args(FaceKind):
         raise ValueError(f"`kind` is one of {', '.join(get_args(FaceKind))}; got {kind!r}.")
     if part is not None and part not in get_args(PartKind):
@@ -89,8 +87,10 @@ def make_control_mesh(scan: Scan, *, faces: int, kind: FaceKind, closed: bool | 
         raise ValueError(f"`faces` must be {_LEAST_FACES} or more; got {faces}.")
     _need_extra()
     cloud = clean(scan)
-    _warn_of_unit(float(np.linalg.norm(np.ptp(cloud.points, axis=0))))
     chosen, others, findings = choose(find_parts(cloud, closed), part)
+    findings = (*_unit_doubt(float(np.linalg.norm(np.ptp(cloud.points, axis=0)))), *findings)
+    for finding in findings:
+        warnings.warn(finding.text, stacklevel=3)
     area = sum(one.dense.areas.sum() for one in chosen)
     meshes = [_mesh_of(one, max(_LEAST_FACES, round(faces * one.dense.areas.sum() / area)), kind) for one in chosen]
     points = np.asarray(scan.points, np.float64)
@@ -147,13 +147,14 @@ def _need_extra() -> None:
         ) from error
 
 
-def _warn_of_unit(size: float) -> None:
-    if not _SIZES[0] <= size <= _SIZES[1]:
-        warnings.warn(
-            f"the scan measures {size:.3g} across, which is taken as mm. If it is in another unit, read it with "
-            "`scale=`: 1000 for metres, 0.001 for micrometres.",
-            stacklevel=3,
-        )
+def _unit_doubt(size: float) -> tuple[Finding, ...]:
+    if _SIZES[0] <= size <= _SIZES[1]:
+        return ()
+    text = (
+        f"the scan measures {size:.3g} across, which is taken as mm. If it is in another unit, read it with `scale=`: "
+        "1000 for metres, 0.001 for micrometres."
+    )
+    return (Finding("unit", text, {"scan": size}),)
 
 
 # ------------------------------------------------------------------------------------------------------------ placing

@@ -37,12 +37,17 @@ def find_parts(cloud: Cloud, closed: bool | None) -> list[Part]:
     lies on no part is looked at again, for itself.
     """
     if cloud.label is not None:
-        clouds = [
-            _some_of(cloud, cloud.label == one)._replace(label=None) for one in np.unique(cloud.label) if one >= 0
-        ]
-        found = [part for one in clouds for part in find_parts(one, closed)]
-        return sorted(found, key=lambda part: -part.dense.areas.sum())
+        of_labels: list[Part] = []
+        for one in np.unique(cloud.label[cloud.label >= 0]):
+            try:
+                of_labels += find_parts(_some_of(cloud, cloud.label == one)._replace(label=None), closed)
+            except ScanError:
+                continue  # too small, or no surface
+        if of_labels:
+            return sorted(of_labels, key=lambda part: -part.dense.areas.sum())
     parts: list[Part] = []
+    if len(cloud.points) < LEAST_POINTS:
+        raise ScanError(f"{len(cloud.points)} points are too few for a surface; {LEAST_POINTS} are the least.")
     rest, n = _turned_outwards(cloud) if cloud.given else cloud, len(cloud.points)
     found = reconstruct(rest, closed)
     while len(parts) < _MOST_PARTS:

@@ -75,7 +75,7 @@ def _without_strays(cloud: Cloud) -> tuple[Cloud, float]:
     slope = np.linalg.norm(implicit.outward(cloud.points), axis=1)
     off = np.abs(implicit.at(cloud.points)) / np.maximum(slope, 0.1 * np.median(slope))
     wrong = off > max(_FAR_OFF * _MAD * float(np.median(off)), cell)
-    _, near = nearest_rows(KDTree(cloud.points), cloud.points, 2 * NEIGHBOUR)
+    _, near = nearest_rows(KDTree(cloud.points), cloud.points, min(2 * NEIGHBOUR, len(cloud.points)))
     keep = ~wrong | (wrong[near].mean(axis=1) > 0.5)  # many side by side are a place that is too sharp for this surface
     cloud = cloud._replace(points=cloud.points[keep], normals=cloud.normals[keep], reach=cloud.reach[keep])
     return cloud, cell
