@@ -46,8 +46,8 @@ class ScanFit(NamedTuple):
     start: js.ControlMesh
     """Control mesh where the last fit started: aligned, or made from the scan, or split."""
     alignment: Alignment | None
-    """None where the control mesh was made from the scan, or was not to be aligned. Of the template's mirror image, where
-    that was fitted."""
+    """None where the control mesh was made from the scan, or was not to be aligned. Of the template's mirror image,
+    where that was fitted."""
     splits: int
     """How many times the control mesh was split into four times its faces."""
     outcome: Outcome | None

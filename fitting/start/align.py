@@ -269,7 +269,7 @@ def _rows(points: Float[np.ndarray, "p 3"], n: int) -> Float[np.ndarray, "q 3"]:
 def _moments(points: Float[np.ndarray, "n 3"], name: str) -> _Moments:
     centre = points.mean(axis=0)
     x = points - centre
-    _, width, axes = np.linalg.svd(x, full_matrices=False)
+    _, width, axes = np.linalg.svd(x if len(x) > 2 else np.repeat(x, 3, axis=0), full_matrices=False)
     if width[1] <= 1e-6 * width[0] or width[0] <= 1e-12 * np.abs(centre).max():
         where = "one spot" if width[0] <= 1e-12 * np.abs(centre).max() else "a line"
         raise ScanError(
