@@ -200,7 +200,11 @@ def test_resume_compares_all_that_went_in(here, capsys):
     p = problem()
     js.write_mesh("other.obj", js.ControlMesh(p.start.vertices * 1.01, p.mesh.faces, p.start.normals))
     js.write_mesh("bare.obj", js.ControlMesh(p.start.vertices, p.mesh.faces))
-    np.savetxt("normals.xyz", np.hstack([p.points + noise(), p.points]), fmt="%.17g")
+    np.savetxt(
+        "normals.xyz",
+        np.hstack([p.points + noise(), p.points / np.linalg.norm(p.points, axis=1, keepdims=True)]),
+        fmt="%.17g",
+    )
     Path("on_scan.json").write_text('{"a": [1, 2, 3], "b": [4, 9, 6], "c": [7, 8, 1], "d": [0, 1, 9]}')
     marks = ("--landmarks", "on_scan.json", "--control-landmarks", "on_scan.json")
     command = ("scan.xyz", *QUICK, "-o", "out", "--resume")

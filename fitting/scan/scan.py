@@ -30,8 +30,11 @@ def _optional(value: object) -> Array | None:
 def _optional_directions(value: object) -> Array | None:
     if value is None or isinstance(value, Array):
         return _optional(value)
-    rows = np.asarray(value, float)
-    return strong_float(of_moderate_length(rows) if rows.shape[1:] == (3,) else rows)  # the shape is checked later
+    rows = np.asarray(value)
+    if rows.shape[1:] != (3,):
+        return strong_float(rows)  # refused later, by its shape
+    directions = of_moderate_length(rows.astype(float))
+    return strong_float(directions.astype(rows.dtype) if rows.dtype.kind == "f" else directions)
 
 
 def _optional_whole(value: object) -> Array | None:

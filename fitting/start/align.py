@@ -39,7 +39,7 @@ _CLEARLY = 0.75
 _NEARBY = 30.0  # degrees
 _MIRRORED = 0.6
 _FITS = 0.004  # of the size: with so little left, no mirror is looked into
-_ALIKE, _ALIKE_IN_PART = 1.1, 1.5
+_ALIKE, _ALIKE_IN_PART = 1.1, 1.3
 _FAR_ROTATION = 45.0  # degrees: two poses farther apart are two answers
 # Of two poses the better one has more points near. Near is this many times the distance that the nearest 30 % of the
 # points of the best pose keep: a template in its place explains its own bone of two, one blown up neither.
