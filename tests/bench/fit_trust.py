@@ -106,7 +106,7 @@ def _femur(n: int = 5000, sigma: float = 0.2) -> tuple[Float[np.ndarray, "n 3"],
 def two_bones_with_template(shared: Path) -> Situation:
     points, mesh = _femur()
     both = np.concatenate([points, points + (110.0, 0, 0)])
-    return Situation(fitting.Scan(both), mesh, {"levels": 2}, points[:2000], deserves_a_word=True)
+    return Situation(fitting.Scan(both), mesh, {"levels": 2}, points, deserves_a_word=True)
 
 
 def table_with_template(shared: Path) -> Situation:
@@ -115,7 +115,7 @@ def table_with_template(shared: Path) -> Situation:
     table = np.random.default_rng(0).uniform(low - 80, high + 80, (5000, 3))
     table[:, 2] = low[2] - 3
     both = np.concatenate([points, table])
-    return Situation(fitting.Scan(both), mesh, {"levels": 2}, points[:2000], deserves_a_word=True)
+    return Situation(fitting.Scan(both), mesh, {"levels": 2}, points, deserves_a_word=True)
 
 
 def half_head(turn: float) -> Callable[[Path], Situation]:
