@@ -2,7 +2,6 @@
 
 import json
 import os
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -116,9 +115,9 @@ def read_marks(folder: str | os.PathLike[str]) -> dict[str, str]:
     """
     path = Path(folder) / _FIT
     try:
-        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
-            return json.loads(str(file["marks"])) if "marks" in file else {}
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        marks = read_arrays(path, "marks".__eq__, text=True).get("marks")
+        return {} if marks is None else json.loads(str(marks))
+    except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
