@@ -58,7 +58,8 @@ def find_parts(cloud: Cloud, closed: bool | None) -> list[Part]:
             it = own == i
             if it.sum() >= LEAST_POINTS or not parts:
                 topology = found.topology if i == 0 else face_topology({3: dense.faces, 4: np.zeros((0, 4), np.int64)})
-                parts.append(Part(_some_of(found.cloud, it), dense, topology))
+                part = Part(_some_of(found.cloud, it), dense, topology)
+                parts.append(part if cloud.given else _outside_out(part))
         beside = _nearest_piece(rest.points, rest.reach, found.pieces) < 0
         if beside.sum() < max(_MORE * n, LEAST_POINTS):
             break
@@ -111,6 +112,15 @@ def _nearest_piece(points: Float[np.ndarray, "p 3"], reach: Float[np.ndarray, "p
     owner = np.repeat(np.arange(len(pieces)), [len(piece.vertices) for piece in pieces])
     distance, row = KDTree(np.concatenate([piece.vertices for piece in pieces])).query(points, workers=-1)
     return np.where(distance <= _NEAR * np.maximum(reach, np.median(reach)), owner[row], -1)
+
+
+def _outside_out(part: Part) -> Part:
+    """The same with its outside out: of two objects at once, one may come out turned against the other."""
+    a, b, c = np.moveaxis(part.dense.vertices[part.dense.faces] - part.dense.vertices.mean(axis=0), 1, 0)
+    if not part.topology.is_closed or np.einsum("tx,tx->", a, np.cross(b, c)) >= 0:
+        return part
+    dense = Dense(part.dense.vertices, part.dense.faces[:, ::-1])
+    return Part(part.cloud._replace(normals=-part.cloud.normals), dense, part.topology)
 
 
 def _turned_outwards(cloud: Cloud) -> Cloud:
