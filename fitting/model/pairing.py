@@ -13,7 +13,7 @@ from jaxsubdiv import corner_weights
 from jaxsubdiv.linalg import dot, norm, unit
 
 from ..scan.closest_points import boundary_vertices, nearest_rows
-from ..scan.outliers import NEIGHBOURS, first_of_each, is_dense, scattered_points
+from ..scan.outliers import NEIGHBOURS, is_dense, rows_for_density, scattered_points
 from ..scan.scan import Scan
 from ..scan.slices import Strokes, find_strokes
 from .priors.shifts import SlicePlanes
@@ -72,7 +72,7 @@ def surroundings(scan: Scan) -> Surroundings:
     crowded, scattered = np.zeros((2, scan.n_points), bool)
     neighbours = np.zeros((scan.n_points, min(_NEIGHBOURS, max(len(counted) - 1, 1))), np.int32)
     if len(counted):
-        apart = counted[first_of_each(points)]
+        apart = counted[rows_for_density(points)]
         others = points if len(apart) == len(counted) else np.asarray(scan.points)[apart]
         distances, rows = nearest_rows(KDTree(others), points, min(NEIGHBOURS + 1, len(others)))
         crowded[counted] = is_dense(distances[:, -1])

@@ -9,6 +9,7 @@ from .closest_points import nearest_rows
 NEIGHBOURS = 10
 # 95 % and more of the points in a ball have neighbours so thick, of the sparse points of a hand-traced head 7 %.
 _AROUND, _THICK = 16, 1 / 3
+_FEW_REPEATS = 0.9
 _LOW = 0.2  # with 60 % of outliers a third of the surface's own points still lies below this quantile
 
 
@@ -56,6 +57,12 @@ def neighbour_distance(points: Float[np.ndarray, "p 3"], k: int = NEIGHBOURS) ->
 def first_of_each(points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, "q"]:
     """Rows of the points without repeats: those would be each other's neighbours, and make all others seem thin."""
     return np.sort(np.unique(points, axis=0, return_index=True)[1])
+
+
+def rows_for_density(points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, "q"]:
+    """All rows, or those of the points without repeats where these are a tenth or more: few change no density."""
+    rows = first_of_each(points)
+    return rows if len(rows) < _FEW_REPEATS * len(points) else np.arange(len(points))
 
 
 def one_a_cell(points: Float[np.ndarray, "p 3"], cell: float) -> Int[np.ndarray, "c"]:

@@ -15,7 +15,7 @@ import jaxsubdiv as js
 from ..finding import Finding, Pose
 from ..scan.closest_points import nearest_rows
 from ..scan.landmarks import Landmarks, Placed, place_landmarks
-from ..scan.outliers import dense_points, first_of_each, one_a_cell
+from ..scan.outliers import dense_points, one_a_cell, rows_for_density
 from ..scan.scan import Scan, ScanError
 
 Kind: TypeAlias = Literal["rigid", "similarity", "affine"]
@@ -24,8 +24,8 @@ _AT_MOST = 20_000  # points of the scan that are looked at
 _COARSE = (250, 1500)  # points of the scan and samples of the template, for every start
 _FINE = (1500, 8000)  # for the best starts
 _FIRST_STEPS, _COARSE_STEPS, _FINE_STEPS = 5, 12, 40
-_COARSE_BEST = 12
-_REFINED = 4
+_COARSE_BEST = 8
+_REFINED = 3
 _SAME_TURN = 10.0  # degrees: two starts that came so near each other come to one pose
 _MOVED = 1e-4  # of the size: a smaller step ends the search
 # Along the surface a pair pulls this much of what it pulls across: enough to hold what no point-to-plane row holds
@@ -206,6 +206,8 @@ def align(
     chosen = min(
         fine, key=lambda one: one.near_score(near) * (_CLEARLY if _angle(one.pose.linear) < 2 * _NEARBY else 1)
     )
+    # Of those that came to nearly one pose, the one whose nearer points lie nearest.
+    chosen = min((one for one in fine if _apart(one, chosen) < _SAME_TURN), key=lambda one: one.score)
     others: list[_Found] = []
     if start is None:
         own = _search(chosen.pose, few, sample_faces(mesh, _COARSE[1]), free, keep, None, _COARSE_STEPS)
@@ -253,7 +255,8 @@ def _thinned(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "q 3"]:
     """The scan without what is scattered, at an even density."""
     if len(points) < 10:
         raise ScanError(f"a scan of {len(points)} points cannot be aligned; 10 are the least.")
-    points = _rows(points[first_of_each(points)], _AT_MOST)
+    points = _rows(points, _AT_MOST)
+    points = points[rows_for_density(points)]
     dense = points[dense_points(points)]
     extent = np.ptp(dense, axis=0).max()
     cell = extent / 40
@@ -389,11 +392,11 @@ def _best_starts(
 
 
 def _best_apart(found: list[_Found], n: int) -> list[_Found]:
-    """The first, and of the others the best `n` that are turned differently from each other."""
-    apart: list[_Found] = []
-    for one in sorted(found[1:], key=lambda one: one.score):
-        turned = (_angle(one.pose.linear @ np.linalg.inv(other.pose.linear)) for other in apart)
-        if len(apart) < n and all(angle > _SAME_TURN for angle in turned):
+    """The first, the best `n` of the others, and up to `n` more that are turned differently from all of these."""
+    others = sorted(found[1:], key=lambda one: one.score)
+    apart = others[:n]
+    for one in others[n:]:
+        if len(apart) < 2 * n and all(_apart(one, other) > _SAME_TURN for other in apart):
             apart.append(one)
     return found[:1] + apart
 
@@ -481,6 +484,11 @@ def _step(
 # ------------------------------------------------------------------------------------------------------------- doubts
 
 
+def _apart(one: _Found, other: _Found) -> float:
+    """Degrees between two poses."""
+    return _angle(one.pose.linear @ np.linalg.inv(other.pose.linear))
+
+
 def _angle(linear: Float[np.ndarray, "3 3"]) -> float:
     """Degrees by which a similarity turns."""
     turn = linear / np.cbrt(np.linalg.det(linear))
@@ -501,7 +509,7 @@ def _other_answers(chosen: _Found, others: list[_Found], share_of_template: floa
     alike = _ALIKE if share_of_template > _WHOLE else _ALIKE_IN_PART
     near = _near([chosen, *others])
     for other in others:
-        angle = _angle(other.pose.linear @ np.linalg.inv(chosen.pose.linear))
+        angle = _apart(other, chosen)
         as_near = other.near_score(near) < alike * chosen.near_score(near)
         if angle > _FAR_ROTATION and other.score < alike * chosen.score and as_near:
             return [
