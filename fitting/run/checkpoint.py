@@ -70,10 +70,11 @@ class Checkpoint:
             return None
         leaves, structure = jax.tree.flatten(like)
         for i, leaf in enumerate(leaves):
-            if f"leaf {i}" not in arrays or arrays[f"leaf {i}"].shape != np.shape(leaf):
+            found = arrays.get(f"leaf {i}")
+            if found is None or found.shape != np.shape(leaf) or found.dtype.kind != np.asarray(leaf).dtype.kind:
                 raise ValueError(
-                    f"{self.path} is no checkpoint of this fit: the array 'leaf {i}' is missing or of another shape. "
-                    "Delete it to start anew."
+                    f"{self.path} is no checkpoint of this fit: the array 'leaf {i}' is missing, or of another shape "
+                    "or kind. Delete it to start anew."
                 )
         return jax.tree.unflatten(structure, [_as(arrays[f"leaf {i}"], leaf) for i, leaf in enumerate(leaves)])
 
@@ -101,6 +102,7 @@ def differing(some: Mapping[str, str], others: Mapping[str, str]) -> list[str]:
 
 
 def _as(array: np.ndarray, leaf: Any) -> Any:
+    array = array.astype(np.asarray(leaf).dtype, copy=False)  # a damaged file may name a precision that JAX lacks
     return jnp.asarray(array) if isinstance(leaf, jax.Array) else array
 
 

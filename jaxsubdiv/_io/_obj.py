@@ -247,5 +247,6 @@ def _per_vertex(
 
 def _unit(rows: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Rows of length one; a zero row stays."""
-    length = np.linalg.norm(rows, axis=1, keepdims=True)
-    return rows / np.where(length > 0, length, 1)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite then is named later by its row
+        length = np.linalg.norm(rows, axis=1, keepdims=True)
+        return rows / np.where(length > 0, length, 1)

@@ -84,9 +84,8 @@ class _Cursor:
         text = self.data[self.at : end].decode("ascii", errors="replace")
         values = parse_numbers(text)
         if len(values) < n:
-            self.refuse(
-                f"'{next(word for word in text.split() if len(parse_numbers(word)) != 1)[:40]}' is not a number"
-            )
+            wrong = next((word for word in text.split() if len(parse_numbers(word)) != 1), text)
+            self.refuse(f"'{wrong[:40]}' is not a number")
         self.at = end
         return values
 
