@@ -588,8 +588,9 @@ def _in_words(pose: _Map, surface: _Surface, points: Float[np.ndarray, "p 3"], l
     middle = surface.points.mean(axis=0, keepdims=True)
     there = pose(surface.points)
     # Where points lie far apart, none may be as near to a sample of the template as it is to the surface between them.
-    apart = nearest_rows(KDTree(points), points, min(_APART, len(points)))[0][:, -1]
-    near = KDTree(points).query(there)[0] <= np.hypot(limit, 2 * np.median(apart))
+    tree = KDTree(points)
+    apart = nearest_rows(tree, points, min(_APART, len(points)))[0][:, -1]
+    near = tree.query(there)[0] <= np.hypot(limit, 2 * np.median(apart))
     moved = float(np.linalg.norm(pose(middle) - middle))
     return Pose(_angle(turn), scale, moved, share, float(near.mean()))
 

@@ -13,6 +13,7 @@ from ..scan.slices import contour_spacing
 from .mesh_topology import component_labels
 from .orient import flipped, orient, plane_fits
 from .poisson import Implicit, poisson
+from .remesh import Dense
 
 LEAST_POINTS = 50
 NEIGHBOUR = 10  # the one whose distance tells the density
@@ -61,7 +62,7 @@ def clean(scan: Scan) -> Cloud:
     used = np.ones(len(points), bool) if scan.weights is None else np.asarray(scan.weights) > 0
     if scan.faces is not None:
         used &= np.bincount(scan.faces.ravel(), minlength=len(points)) > 0
-        given = normals_of_faces(points, scan.faces) if given is None else given
+        given = Dense(points, scan.faces).normals() if given is None else given
     rows = np.flatnonzero(used)
     rows = rows[first_of_each(points[rows])]
     if len(rows) > _AT_MOST:
@@ -86,15 +87,6 @@ def _large_components(
     if len(large) < 2 or counts[large].sum() < _MOST_OF_IT * used.sum():
         return None
     return np.where(np.isin(label, large), label, -1)
-
-
-def normals_of_faces(points: Float[np.ndarray, "p 3"], faces: Int[np.ndarray, "t 3"]) -> Float[np.ndarray, "p 3"]:
-    """Of every point the sum of its faces' vector areas; zero where it has none."""
-    a, b, c = np.moveaxis(points[faces], 1, 0)
-    areas, normals = np.cross(b - a, c - a), np.zeros_like(points)
-    for corner in faces.T:
-        np.add.at(normals, corner, areas)
-    return normals
 
 
 def clean_points(

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from ..finding import Finding
 from ..scan.scan import ScanError
 from .cloud import LEAST_POINTS, Cloud, clean_points
-from .mesh_topology import MeshTopology, face_topology
+from .mesh_topology import MeshTopology
 from .reconstruct import is_closed, reconstruct
 from .remesh import Dense
 
@@ -57,7 +57,7 @@ def find_parts(cloud: Cloud, closed: bool | None) -> list[Part]:
         for i, dense in enumerate(found.pieces):
             it = own == i
             if it.sum() >= LEAST_POINTS or not parts:
-                topology = found.topology if i == 0 else face_topology({3: dense.faces, 4: np.zeros((0, 4), np.int64)})
+                topology = found.topology if i == 0 else dense.topology()
                 part = Part(_some_of(found.cloud, it), dense, topology)
                 parts.append(part if cloud.given else _outside_out(part))
         beside = _nearest_piece(rest.points, rest.reach, found.pieces) < 0

@@ -13,7 +13,7 @@ from jaxsubdiv.half_edges import half_edges
 from ..scan.closest_points import nearest_rows
 from ..scan.scan import ScanError
 from .cloud import NEIGHBOUR, Cloud, settle
-from .mesh_topology import MeshTopology, face_topology
+from .mesh_topology import MeshTopology
 from .poisson import Implicit
 from .remesh import Dense
 
@@ -52,7 +52,7 @@ def reconstruct(cloud: Cloud, closed: bool | None) -> Reconstruction:
         pieces = _pieces_of_surface(settled, implicit, closed)
         if not pieces:
             raise ScanError("no surface: the points are scattered in space. Was the right file read?")
-        topology = face_topology({3: pieces[0].faces, 4: np.zeros((0, 4), np.int64)})
+        topology = pieces[0].topology()
         if best is None or topology.genus < best.topology.genus:
             best = Reconstruction(settled, pieces, topology)
         if topology.genus == 0:

@@ -37,6 +37,10 @@ class Dense(NamedTuple):
         a, b, c = np.moveaxis(self.vertices[self.faces], 1, 0)
         return _vertex_sum(np.cross(b - a, c - a), self.faces, len(self.vertices))
 
+    def topology(self) -> MeshTopology:
+        """Its parts, rims and handles."""
+        return face_topology({3: self.faces, 4: np.zeros((0, 4), np.int64)})
+
 
 class Coarse(NamedTuple):
     """A coarse mesh."""
