@@ -24,8 +24,9 @@ from jaxsubdiv.console import in_colour, lasting_streams, plain_warnings, printa
 from jaxsubdiv.files import replacing
 
 from .image.boundary import suggest_settings
-from .image.read import is_image, read_labels, read_scan, read_volume, scan_of_volume, stem
-from .image.volume import Label, Volume
+from .image.read import Seen, is_image, read_labels, read_scan, read_seen, stem
+from .image.slices import Slice, cut_slices
+from .image.volume import Label
 from .model.limits import check_numbers
 from .model.priors.boundary import BoundaryCurve, boundary_of
 from .report.page import write_page
@@ -88,7 +89,7 @@ class _Job(NamedTuple):
     mesh: js.ControlMesh | None
     landmarks: Landmarks | None
     boundary: BoundaryCurve | None = None
-    image: Volume | None = None
+    seen: Seen | None = None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -230,7 +231,7 @@ def _fit(scan: _Source | None, folder: Path, options: argparse.Namespace, recipe
     job = _inputs(scan, options)
     slices = "" if job.scan.slices is None else f" in {len(np.unique(job.scan.slices))} slices"
     print(f"scan     {job.scan.n_points:,} points{slices}, {_size(np.asarray(job.scan.points))}")
-    if job.image is not None:
+    if job.seen is not None:
         recipe = _with_suggested(recipe, job.scan, options)
     marks = _marks(job, recipe)
     done = _done(folder, marks) if options.resume else None
@@ -255,9 +256,16 @@ def _fit(scan: _Source | None, folder: Path, options: argparse.Namespace, recipe
     seconds = time.perf_counter() - began
     report, off = found.result.report(uncertainty=True), misfit(found.result)
     print(f"done     in {seconds:.1f} s{_ending(found, off)}\n\n{dataclasses.replace(report, warnings=[])}\n")
-    _save(folder, found, title, marks)
+    _save(folder, found, title, marks, _slices_of(job, found.result))
     _print_warnings(found.result)
     return _row(title, found.result, off, seconds)
+
+
+def _slices_of(job: _Job, result: FitResult) -> Sequence[Slice]:
+    """Of the image, where there was one."""
+    if job.seen is None:
+        return ()
+    return cut_slices(job.seen.volume, np.asarray(result.surface.vertices, np.float64), label=job.seen.label)
 
 
 def _print_warnings(result: FitResult) -> None:
@@ -326,10 +334,10 @@ def _inputs(scan: _Source | None, options: argparse.Namespace) -> _Job:
         points, mesh = example(options.example)
         noise = np.random.default_rng(0).normal(scale=_EXAMPLE_NOISE, size=mesh.vertices.shape)
         return _Job(options.example, points, js.ControlMesh(mesh.vertices + noise, mesh.faces, mesh.normals), None)
-    file, image = scan.path, None
+    file, seen = scan.path, None
     if is_image(file) and not options.labels:
-        image = read_volume(file, scale=options.scale)
-        points = scan_of_volume(image, file.name, label=scan.label, above=options.above)
+        seen = read_seen(file, scale=options.scale, label=scan.label, above=options.above)
+        points = seen.scan
     else:
         points = read_scan(file, scale=options.scale, labels=options.labels, label=options.label, above=options.above)
     mesh = None if options.control is None else js.read_mesh(options.control, scale=options.control_scale)
@@ -352,7 +360,7 @@ def _inputs(scan: _Source | None, options: argparse.Namespace) -> _Job:
         boundary = BoundaryCurve(boundary_of(js.read_mesh(file, scale=options.scale, check=False)))
     elif options.boundary is not None:
         boundary = BoundaryCurve(js.read_points(options.boundary, scale=options.scale).points)
-    return _Job(scan.title, points, mesh, landmarks, boundary, image)
+    return _Job(scan.title, points, mesh, landmarks, boundary, seen)
 
 
 def _ending(found: ScanFit, off: float) -> str:
@@ -361,7 +369,7 @@ def _ending(found: ScanFit, off: float) -> str:
     return f"; split {found.splits} times, {found.outcome}: the surface is {off:.3f} mm off the scan beside the noise"
 
 
-def _save(folder: Path, found: ScanFit, title: str, marks: dict[str, str]) -> None:
+def _save(folder: Path, found: ScanFit, title: str, marks: dict[str, str], slices: Sequence[Slice]) -> None:
     """The fit as files, all of them in place of those of an earlier one, or none."""
     result = found.result
     written = ["control.obj", "surface.ply", "report.json", "fit.html", "fit.npz", "recipe.json"]
@@ -370,11 +378,11 @@ def _save(folder: Path, found: ScanFit, title: str, marks: dict[str, str]) -> No
         values = {"distance_mm": surface_distances(result), "deviation_mm": result.uncertainty().surface}
         js.write_mesh(new / "surface.ply", result.surface, vertex_data=values)
         (new / "report.json").write_text(result.report(uncertainty=True).as_json() + "\n", encoding="utf-8")
-        write_page(new / "fit.html", result, title=title, start=found.start)
+        write_page(new / "fit.html", result, title=title, start=found.start, slices=slices)
         assert result.recipe is not None
         save_fit(new, result.fit, result.recipe, marks)
         try:
-            draw_fit(result, found.start, title=title).savefig(new / "fit.png")
+            draw_fit(result, found.start, title=title, slices=slices).savefig(new / "fit.png")
             written.append("fit.png")
         except ImportError as error:
             print(f"note     no picture: {error}")
