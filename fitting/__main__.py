@@ -36,8 +36,8 @@ from .report.saved import read_marks, save_fit
 from .run.checkpoint import differing, marks_of
 from .run.fit import Sweep
 from .run.fit_scan import ScanFit, misfit
-from .run.folder import FIT, filling, is_unfinished, working_in
-from .run.names import SUMMARY, find_scans, name_folders
+from .run.folder import FIT, SUMMARY, filling, is_unfinished, working_in
+from .run.names import find_scans, name_folder, name_folders
 from .run.recipe import Recipe, load, load_recipe
 from .scan.example import Example, example
 from .scan.landmarks import Landmarks, match_landmarks, read_landmarks
@@ -78,7 +78,8 @@ class _Source(NamedTuple):
         if self.label is None:
             return self.path
         word = str(self.label.name or self.label.value) if isinstance(self.label, Label) else self.label
-        return self.path.with_name(f"{stem(self.path)}_{''.join(c if c.isalnum() else '_' for c in word)}.scan")
+        name = f"{stem(self.path)}_{word}"
+        return self.path.with_name("".join(c if c.isalnum() or c in "-_ " else "_" for c in name))
 
 
 class _Job(NamedTuple):
@@ -115,7 +116,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         if len(scans) > 1:
             return _run_all(scans, options, recipe)
         scan = scans[0] if scans else None
-        folder = Path(options.output or f"fit_{stem(scan.as_file) if scan else options.example}")
+        folder = Path(options.output or (name_folder(scan.as_file) if scan else f"fit_{options.example}"))
         return _run(scan, folder, options, recipe, scan.title if scan else options.example)["status"]
     except KeyboardInterrupt:
         skips = "; with --resume it skips the scans that are done" if len(scans) > 1 else ""
@@ -475,7 +476,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("scans", nargs="*", metavar="SCAN", help="points or meshes, or folders of them: .ply .xyz .csv .txt .npz .vtp")
     add("--control", metavar="MESH", help="template of triangles and quads to start from; default: made from the scan")
-    add("-o", "--output", metavar="OUT", help="folder for the results (default: fit_ and the scan's name, or fits)")
+    add("-o", "--output", metavar="OUT", help="folder for the results (default: fit_ and the scan's file, or fits)")
     add("--faces", type=int, help=f"of the control mesh, where it is made (default: {Recipe.faces})")
     add("--kind", choices=("triangle", "quad"), help=f"of these faces (default: {Recipe.kind})")
     add("--closed", action=argparse.BooleanOptionalAction, help="whether the anatomy is; default: found from the scan")
