@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 
+from ..image.read import is_image, stem
 from .folder import SUMMARY, results_in
 
 _SCAN_FILES = {".ply", ".xyz", ".csv", ".txt", ".npz", ".vtp", ".vtk", ".stl", ".obj", ".off", ".gii"}
@@ -35,7 +36,7 @@ def find_scans(given: Sequence[Path]) -> list[Path]:
 
 
 def _is_scan(file: Path) -> bool:
-    return file.suffix.lower() in _SCAN_FILES and not file.is_dir()
+    return (file.suffix.lower() in _SCAN_FILES or is_image(file)) and not file.is_dir()
 
 
 def name_folders(scans: Sequence[Path]) -> list[str]:
@@ -70,7 +71,7 @@ def name_folder(scan: Path) -> str:
 def _choices(scan: Path) -> list[str]:
     """Names for one scan, from the shortest on."""
     parts = Path(os.path.abspath(scan)).parts[1:]
-    return [scan.stem] + ["_".join(parts[i:]) for i in reversed(range(len(parts)))]
+    return [stem(scan)] + ["_".join(parts[i:]) for i in reversed(range(len(parts)))]
 
 
 def _key(name: str) -> str:
