@@ -11,7 +11,8 @@ from jax.experimental.compilation_cache import compilation_cache
 
 # XLA's newer emitters take three times as long to compile, and every program here is compiled to run a few times. Given
 # before the first program is compiled, and in the environment, so that commands in processes of their own have it too.
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
+if jax.__version_info__ < (0, 11):  # later ones may have no others, and end Python where they do not know a flag
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_disable_most_optimizations", True)  # programs that run a few times take longer to be made fast
 jax.config.update("jax_numpy_rank_promotion", "raise")
