@@ -164,7 +164,7 @@ class FitResult:
 
     @property
     def inliers(self) -> Bool[np.ndarray, "p"]:
-        return np.abs(self.distances) <= 3 * self.noise
+        return self.fit.inliers
 
     def report(self, *, uncertainty: bool = False) -> Report:
         """The fit in numbers: `print` it, or take `.as_dict()`.
