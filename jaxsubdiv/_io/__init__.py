@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from .._mesh import ControlMesh
 from ..errors import MeshError, name_rows
 from ..files import replacing
-from . import _arrays, _freesurfer, _gifti, _markups, _obj, _off, _ply, _stl, _table, _vtk, _vtp
+from . import _arrays, _digitiser, _freesurfer, _gifti, _markups, _obj, _off, _pcd, _ply, _stl, _table, _vtk, _vtp
 from ._contents import Contents, VertexData, doubles, warn
 
 __all__ = ["PointCloud", "Surface", "read_mesh", "read_points", "write_mesh"]
@@ -63,18 +63,26 @@ class _Format(NamedTuple):
 
 _TABLE = _Format(None, _table.read, None)
 _MARKUPS = _Format(None, _markups.read, None)
+_DIGITISER = _Format(None, _digitiser.read, None)
+_FREESURFER = _Format(_freesurfer.read_binary, _freesurfer.read_binary, _freesurfer.write)
+_GIFTI_DATA = _Format(_gifti.read, _gifti.read_points, _gifti.write_data, holds_data=True)
 _FORMATS = {
     ".obj": _Format(_obj.read, _obj.read_points, _obj.write),
     ".ply": _Format(_ply.read, _ply.read_points, _ply.write, holds_data=True),
     ".off": _Format(_off.read, _off.read_points, _off.write),
     ".stl": _Format(_stl.read, _stl.read, _stl.write),
     ".vtp": _Format(_vtp.read, _vtp.read_points, _vtk.write, holds_data=True),
+    ".vtu": _Format(_vtp.read, _vtp.read_points, None),
     ".vtk": _Format(_vtk.read, _vtk.read_points, _vtk.write, holds_data=True),
+    ".shape.gii": _GIFTI_DATA,
     ".gii": _Format(_gifti.read, _gifti.read_points, _gifti.write),
     ".npz": _Format(_arrays.read_npz, _arrays.read_points, _arrays.write),
-    ".asc": _Format(_freesurfer.read, _freesurfer.read_points, None),
+    ".asc": _Format(_freesurfer.read_text, _freesurfer.read_points, None),
+    **dict.fromkeys((".surf", ".white", ".pial", ".inflated", ".smoothwm", ".orig", ".sphere"), _FREESURFER),
     ".npy": _Format(None, _arrays.read_points, None),
-    **dict.fromkeys((".xyz", ".csv", ".txt"), _TABLE),
+    ".pcd": _Format(None, _pcd.read, None),
+    **dict.fromkeys((".xyz", ".csv", ".txt", ".pts", ".particles"), _TABLE),
+    **dict.fromkeys((".hsp", ".elp", ".pos"), _DIGITISER),
     **dict.fromkeys((".json", ".fcsv"), _MARKUPS),
 }
 
@@ -90,8 +98,11 @@ def read_mesh(path: str | os.PathLike[str], *, scale: float | int = 1.0, check: 
     - `.ply`: text, or binary of either byte order; other properties are left out.
     - `.off`: also NOFF; colours are left out.
     - `.stl`: text or binary; equal corners become one vertex; the normals of the facets are left out.
-    - `.vtp`, `.vtk`: polygons (legacy VTK: of a POLYDATA file).
-    - `.asc`: surfaces of FreeSurfer as text.
+    - `.vtp`, `.vtu`, `.vtk`: polygons and triangle strips, and the triangles and quads of unstructured grids; points
+      and lines are left out, and cells of volumes refused.
+    - `.surf`, `.white`, `.pial`, `.inflated`, `.smoothwm`, `.orig`, `.sphere`: binary surfaces of FreeSurfer, which
+      are known by their first bytes under any other name too (`lh.sphere.reg`). Coordinates stay surface RAS, as
+      stored; a warning says where the scanner's RAS is another. `.asc`: the same as text.
     - `.gii`: GIfTI. Coordinates stay as stored: a coordinate transform in the file that is not the
       identity is not applied, and a warning says so.
     - `.npz`: `control_points`, `control_faces`, `control_normals`; or `vertices`, `normals` and `faces`, or `triangles`
@@ -131,12 +142,16 @@ def read_points(path: str | os.PathLike[str], *, scale: float | int = 1.0) -> Po
 
     Every format of `read_mesh`, whose vertices are then the points, used or not, whatever its faces are; and:
 
-    - `.xyz`, `.csv`, `.txt`, `.asc`: one point a line; commas, semicolons, tabs or white space part the columns; `#`,
-      `//` and `;` begin comments. A header row names the columns, of `x y z nx ny nz weight` in any order, with units
-      or as ParaView writes them; others are left out. Without one the first three columns are x, y and z, and three
-      others are the normals where their lengths are near 1; a warning says what was left out. Decimals may have commas
-      where these do not part the columns; a first row may give the number of points.
+    - `.xyz`, `.csv`, `.txt`, `.asc`, `.pts` (Leica's, and digitisers'), `.particles` (ShapeWorks): one point a line;
+      commas, semicolons, tabs or white space part the columns; `#`, `//` and `;` begin comments. A header row names the
+      columns, of `x y z nx ny nz weight` in any order, with units or as ParaView and biv-me write them; others are left
+      out. Without one the first three columns are x, y and z, and three others are the normals where their lengths are
+      near 1; a warning says what was left out. Decimals may have commas where these do not part the columns; a first
+      row may give the number of points.
     - `.npz`: `points`, and `normals` and `weights` if present. `.npy`: one array `[p, 3]`.
+    - `.pcd`: text, binary or compressed; x, y, z and normal_x, normal_y, normal_z. A viewpoint is not applied.
+    - `.hsp`, `.elp`, `.pos`: heads traced with a Polhemus digitiser, fiducials among the points. Programs write the
+      first two in metres and the last in centimetres; without a `scale` a warning says so.
     - `.mrk.json`, `.fcsv`: control points of 3D Slicer, in the frame that the file names; a warning says which.
 
     Points that are not finite are dropped, and a warning counts them. Normals that are not finite become zero, which
@@ -161,7 +176,7 @@ def read_labelled_points(
     """The points of `read_points`, and columns of text beside them: those of the names that a table's header has."""
     path, format_ = _open(path)
     _check_scale(scale)
-    contents = format_.read_points(path)
+    contents = _told_unit(path, format_.read_points(path), scale)
     points = _scaled(_numbers(path.name, "points", contents.vertices, (None, 3)), scale)
     n = len(points)
     normals = None if contents.normals is None else _numbers(path.name, "normals", contents.normals, (n, 3))
@@ -184,6 +199,14 @@ def read_labelled_points(
     return cloud, {
         name: [text for text, keep in zip(column, kept, strict=True) if keep] for name, column in texts.items()
     }
+
+
+def _told_unit(path: Path, contents: Contents, scale: float | int) -> Contents:
+    """The contents, after a warning where their format has a unit of its own and no scale was given."""
+    if contents.usual_unit is not None and scale == 1:
+        unit, to_mm = contents.usual_unit
+        warn(path, f"{path.suffix} files are in {unit}, as programs write them. A scale of {to_mm:g} takes that to mm.")
+    return contents
 
 
 def _present(path: Path, normals: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"] | None:
@@ -243,14 +266,23 @@ def _open(path: str | os.PathLike[str]) -> tuple[Path, _Format]:
         raise MeshError(f"{path}: this is a folder. Name a file in it.")
     if not path.exists():
         raise FileNotFoundError(errno.ENOENT, "no such file", str(path))
-    format_ = _format(path)
+    known = _known_format(path)
+    if known is None and _freesurfer.is_binary(path):  # `lh.sphere.reg` and the like
+        known = _FREESURFER
+    format_ = known or _format(path)
     if path.stat().st_size == 0:
         raise MeshError(f"{path.name}: the file is empty. Was it copied to its end?")
     return path, format_
 
 
+def _known_format(path: Path) -> _Format | None:
+    """The format of a suffix, which may have two parts."""
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    return _FORMATS.get("".join(suffixes[-2:])) or _FORMATS.get(path.suffix.lower())
+
+
 def _format(path: Path) -> _Format:
-    format_ = _FORMATS.get(path.suffix.lower())
+    format_ = _known_format(path)
     if format_ is None:
         raise MeshError(
             f"{path.name}: the suffix '{path.suffix}' is not known. Meshes: {_suffixes('read_mesh')}. Points, besides: "
@@ -260,7 +292,10 @@ def _format(path: Path) -> _Format:
 
 
 def _suffixes(able_to: str) -> str:
-    return ", ".join(suffix for suffix, format_ in _FORMATS.items() if getattr(format_, able_to))
+    able = {suffix: format_ for suffix, format_ in _FORMATS.items() if getattr(format_, able_to)}
+    return ", ".join(
+        suffix for suffix, format_ in able.items() if format_ is not _GIFTI_DATA or able_to == "holds_data"
+    )
 
 
 def _check_scale(scale: float | int) -> None:

@@ -6,7 +6,7 @@ Not read by nibabel: some numbers in a damaged file make it loop without end.
 import math
 import re
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -14,7 +14,16 @@ from jaxtyping import Float, Shaped
 
 from ..errors import MeshError
 from . import _xml
-from ._contents import Contents, VertexData, doubles, library, warn, whole
+from ._contents import (
+    Contents,
+    VertexData,
+    doubles,
+    in_single_precision,
+    library,
+    triangles_only,
+    warn,
+    whole,
+)
 from ._text import parse_rows
 
 _NORMALS = "Normals"
@@ -134,23 +143,32 @@ def _unknown(what: str) -> NoReturn:
 
 def write(path: Path, contents: Contents, data: VertexData) -> None:
     """Triangles, in single precision: the standard knows no other. A warning says by how much it rounds."""
-    faces = contents.faces or {}
-    if len(faces.get(4, ())):
-        raise MeshError(
-            f"{path.name}: GIfTI holds triangles only, and the mesh has {len(faces[4])} quads. Write .obj, .ply, .off, "
-            ".vtp, .vtk or .npz, which hold quads."
-        )
     gifti = library("nibabel.gifti", ".gii files")
-    vertices = contents.vertices.astype(np.float32)
-    rounding = np.abs(vertices - contents.vertices).max(initial=0)
-    if rounding > 0:
-        warn(path, f"GIfTI holds single precision: coordinates were rounded, by up to {rounding:.1e}.")
+    vertices = in_single_precision(path, "GIfTI", contents.vertices)
+    triangles = triangles_only(path, "GIfTI", contents).astype(np.int32)
     arrays = [
         gifti.GiftiDataArray(vertices, "NIFTI_INTENT_POINTSET", "NIFTI_TYPE_FLOAT32"),
-        gifti.GiftiDataArray(faces[3].astype(np.int32), "NIFTI_INTENT_TRIANGLE", "NIFTI_TYPE_INT32"),
+        gifti.GiftiDataArray(triangles, "NIFTI_INTENT_TRIANGLE", "NIFTI_TYPE_INT32"),
     ]
     if contents.normals is not None:
-        normals = contents.normals.astype(np.float32)
-        meta = gifti.GiftiMetaData({"Name": _NORMALS})
-        arrays.append(gifti.GiftiDataArray(normals, "NIFTI_INTENT_VECTOR", "NIFTI_TYPE_FLOAT32", meta=meta))
+        arrays.append(_named_array(gifti, _NORMALS, contents.normals, "NIFTI_INTENT_VECTOR"))
     path.write_bytes(gifti.GiftiImage(darrays=arrays).to_bytes())
+
+
+def write_data(path: Path, contents: Contents, data: VertexData) -> None:
+    """The vertex data alone, an array each, as the measurements that go with a `.surf.gii`.
+
+    A file of its own, since Connectome Workbench opens no surface file with more arrays than the surface's two.
+    """
+    gifti = library("nibabel.gifti", ".gii files")
+    if not data:
+        raise MeshError(
+            f"{path.name}: such files hold vertex data alone. Give some, or write the surface to .surf.gii."
+        )
+    arrays = [_named_array(gifti, name, column, "NIFTI_INTENT_SHAPE") for name, column in data.items()]
+    path.write_bytes(gifti.GiftiImage(darrays=arrays).to_bytes())
+
+
+def _named_array(gifti: Any, name: str, values: Shaped[np.ndarray, "v *c"], intent: str) -> Any:
+    meta = gifti.GiftiMetaData({"Name": name})
+    return gifti.GiftiDataArray(values.astype(np.float32), intent, "NIFTI_TYPE_FLOAT32", meta=meta)
