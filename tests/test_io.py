@@ -395,6 +395,7 @@ def test_vertex_data_is_kept(tmp_path, suffix):
         (".ply", {"two words": np.zeros(8)}, "'two words'; PLY needs one ASCII word"),
         (".ply", {"nx": np.zeros(8)}, "'nx'; PLY needs one ASCII word other than x, y, z"),
         (".ply", {"d": np.full(8, 2**40)}, r"`vertex_data\['d'\]` has integers beyond the 32 bits of PLY"),
+        (".surf", {"d": np.zeros(8)}, r"hold no vertex data\. Write \.ply, \.vtp, \.vtk, \.glb, \.shape\.gii"),
         (".vtp", {"Normals": np.zeros(8)}, "'Normals', which the normals of the mesh take"),
     ],
 )  # fmt: skip
@@ -895,7 +896,7 @@ def test_meshes_that_cannot_be_written(tmp_path, change, words):
 # Safe writing
 
 
-@pytest.mark.parametrize("suffix", [".obj", ".off", ".stl", ".gii"])
+@pytest.mark.parametrize("suffix", [".obj", ".off", ".stl", ".gii", ".glb", ".surf"])
 def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch, suffix):
     path = tmp_path / f"a{suffix}"
     mesh = mesh_of("triangles", False, np.float32)
@@ -949,10 +950,12 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch, module, suffix):
 
 
 def test_import_loads_no_heavy_library():
-    code = "import sys, jaxsubdiv._io as io; print(*(m for m in sys.argv[1:] if m in sys.modules))"
-    heavy = ["trimesh", "scipy", "pyvista", "vtkmodules", "nibabel", "meshio"]
-    done = subprocess.run([sys.executable, "-c", code, *heavy], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == []
+    code = "import sys, {}; print(*(m for m in sys.argv[1:] if m in sys.modules))"
+    extras = ["pyvista", "vtkmodules", "nibabel", "meshio", "matplotlib", "tqdm", "pyacvd", "rustworkx"]
+    for package, heavy in (("jaxsubdiv._io", ["trimesh", "scipy", *extras]), ("fitting, fitting.__main__", extras)):
+        command = [sys.executable, "-c", code.format(package), *heavy]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        assert done.stdout.split() == [], package
 
 
 # Files of others

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from .._mesh import ControlMesh
 from ..errors import MeshError, name_rows
 from ..files import replacing
-from . import _arrays, _digitiser, _freesurfer, _gifti, _markups, _obj, _off, _pcd, _ply, _stl, _table, _vtk, _vtp
+from . import _arrays, _digitiser, _freesurfer, _gifti, _glb, _markups, _obj, _off, _pcd, _ply, _stl, _table, _vtk, _vtp
 from ._contents import Contents, VertexData, doubles, warn
 
 __all__ = ["PointCloud", "Surface", "read_mesh", "read_points", "write_mesh"]
@@ -74,6 +74,7 @@ _FORMATS = {
     ".vtp": _Format(_vtp.read, _vtp.read_points, _vtk.write, holds_data=True),
     ".vtu": _Format(_vtp.read, _vtp.read_points, None),
     ".vtk": _Format(_vtk.read, _vtk.read_points, _vtk.write, holds_data=True),
+    ".glb": _Format(_glb.read, _glb.read, _glb.write, holds_data=True),
     ".shape.gii": _GIFTI_DATA,
     ".gii": _Format(_gifti.read, _gifti.read_points, _gifti.write),
     ".npz": _Format(_arrays.read_npz, _arrays.read_points, _arrays.write),
@@ -103,6 +104,8 @@ def read_mesh(path: str | os.PathLike[str], *, scale: float | int = 1.0, check: 
     - `.surf`, `.white`, `.pial`, `.inflated`, `.smoothwm`, `.orig`, `.sphere`: binary surfaces of FreeSurfer, which
       are known by their first bytes under any other name too (`lh.sphere.reg`). Coordinates stay surface RAS, as
       stored; a warning says where the scanner's RAS is another. `.asc`: the same as text.
+    - `.glb`: the triangles of all meshes, as they are stored there: in metres as a rule, told where no `scale` is
+      given. A matrix that places a mesh is not applied, and a warning says so.
     - `.gii`: GIfTI. Coordinates stay as stored: a coordinate transform in the file that is not the
       identity is not applied, and a warning says so.
     - `.npz`: `control_points`, `control_faces`, `control_normals`; or `vertices`, `normals` and `faces`, or `triangles`
@@ -123,7 +126,7 @@ def read_mesh(path: str | os.PathLike[str], *, scale: float | int = 1.0, check: 
     if format_.read_mesh is None:
         raise MeshError(f"{path.name}: {path.suffix} files hold points without faces. Read it with `read_points`.")
     _check_scale(scale)
-    contents = format_.read_mesh(path)
+    contents = _told_unit(path, format_.read_mesh(path), scale)
     if contents.faces is None:
         raise MeshError(f"{path.name}: it holds points but no faces. Read it with `read_points`.")
     vertices = _numbers(path.name, "vertices", contents.vertices, (None, 3))
@@ -205,7 +208,7 @@ def _told_unit(path: Path, contents: Contents, scale: float | int) -> Contents:
     """The contents, after a warning where their format has a unit of its own and no scale was given."""
     if contents.usual_unit is not None and scale == 1:
         unit, to_mm = contents.usual_unit
-        warn(path, f"{path.suffix} files are in {unit}, as programs write them. A scale of {to_mm:g} takes that to mm.")
+        warn(path, f"{path.suffix} files are in {unit} as a rule; a scale of {to_mm:g} takes these to mm.")
     return contents
 
 
@@ -223,9 +226,17 @@ def write_mesh(
 ) -> None:
     """Write a mesh to a file of the format that the suffix names, so that it reads back the same bit for bit.
 
-    Suffixes: `.obj`, `.ply`, `.off`, `.vtp`, `.vtk`, `.npz`; and, with less in them, `.stl`, which holds neither quads
-    (they are split, with a warning) nor normals nor vertices that no face uses, and `.gii`, which holds neither quads
-    (an error) nor double precision (a warning says by how much it rounds).
+    Suffixes: `.obj`, `.ply`, `.off`, `.vtp`, `.vtk`, `.npz`; and, with less in them, where quads are split with a
+    warning, and another says by how much coordinates are rounded to single precision:
+
+    - `.stl`: no normals, and no vertices that no face uses; not rounded.
+    - `.gii`: GIfTI. Vertex data go to a file of their own, `.shape.gii`, of the same mesh.
+    - `.surf`, `.white`, `.pial` and the other names of FreeSurfer that `read_mesh` knows: no normals.
+    - `.glb`: glTF, for web pages and slides. The vertices are in mm as they are here, in a node that takes mm with z up
+      to the metres with y up that glTF has, x staying x, so that programs show the true size; `read_mesh` gives mm
+      again. Of the vertex data the first colour the surface: blue and red below and above 0 where there are both, dark
+      to bright otherwise, grey where a value is not finite. All are kept as attributes too, `_DISTANCE_MM` for
+      `distance_mm`; glTF has no NaN, so that these are 0 there, and so is `_DISTANCE_MM_KNOWN`, which is 1 elsewhere.
 
     The file appears, or takes the place of another, only once it is complete.
 
@@ -233,7 +244,7 @@ def write_mesh(
         path: the file; its folder must be there.
         mesh: a `ControlMesh` or a `RefinedSurface`.
         vertex_data: name -> one number a vertex, shape `[v]`, of any unit: distances, say. Kept by `.ply`, `.vtp` and
-            `.vtk`; an error elsewhere.
+            `.vtk`, `.glb` and `.shape.gii`; an error elsewhere.
 
     Raises:
         FileNotFoundError: the folder does not exist.

@@ -61,7 +61,7 @@ def _written() -> dict[str, bytes]:
     mesh = js.ControlMesh(_BOX, {3: _TRIANGLES}, np.float32(_BOX - 0.5))
     found = {}
     with tempfile.TemporaryDirectory() as folder:
-        for suffix in (".obj", ".ply", ".off", ".stl", ".vtp", ".vtk", ".gii", ".npz", ".surf"):
+        for suffix in (".obj", ".ply", ".off", ".stl", ".vtp", ".vtk", ".gii", ".npz", ".surf", ".glb"):
             path = Path(folder, "own" + suffix)
             js.write_mesh(path, mesh)
             found[path.name] = path.read_bytes()
