@@ -26,7 +26,7 @@ from jaxsubdiv.files import replacing
 from .model.limits import check_numbers
 from .model.priors.boundary import BoundaryCurve, boundary_of
 from .report.page import write_page
-from .report.picture import draw_fit, surface_distances
+from .report.picture import draw_fit
 from .report.result import FitResult
 from .report.saved import read_marks, save_fit
 from .run.checkpoint import differing, marks_of
@@ -312,7 +312,7 @@ def _save(folder: Path, found: ScanFit, title: str, marks: dict[str, str]) -> No
     written = ["control.obj", "surface.ply", "report.json", "fit.html", "fit.npz", "recipe.json"]
     with filling(folder) as new:
         js.write_mesh(new / "control.obj", result.control_mesh)
-        values = {"distance_mm": surface_distances(result), "deviation_mm": result.uncertainty().surface}
+        values = {"distance_mm": result.at_level().distances, "deviation_mm": result.uncertainty().surface}
         js.write_mesh(new / "surface.ply", result.surface, vertex_data=values)
         (new / "report.json").write_text(result.report(uncertainty=True).as_json() + "\n", encoding="utf-8")
         write_page(new / "fit.html", result, title=title, start=found.start)

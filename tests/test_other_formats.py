@@ -230,7 +230,7 @@ def change(*keys, to):
         (change("accessors", 0, "count", to=-1), "`count` is -1, which is no whole number"),
         (change("accessors", 0, "count", to="6"), "`count` is 6"),
         (change("accessors", 0, "type", to="MAT4"), "of another kind than plain VEC3"),
-        (change("accessors", 0, "componentType", to=[1]), "unhashable|another kind"),
+        (change("accessors", 0, "componentType", to=[1]), "`componentType` is .1., which is no whole number"),
         (change("accessors", 0, "sparse", to={}), "of another kind than plain VEC3"),
         (change("accessors", 0, "bufferView", to=99), "`bufferViews` has no entry 99"),
         (change("bufferViews", 0, "byteStride", to=0), "which its bytes do not hold"),

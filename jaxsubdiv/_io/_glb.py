@@ -180,7 +180,7 @@ def _numbers(file: _File, place: Any, kind: str, letter: str) -> Shaped[np.ndarr
     """The numbers of an accessor."""
     accessor = _entry(file.gltf, "accessors", place)
     view = _entry(file.gltf, "bufferViews", accessor["bufferView"])
-    dtype = np.dtype(_TYPES.get(accessor.get("componentType"), "V"))
+    dtype = np.dtype(_TYPES.get(_whole(accessor, "componentType"), "V"))
     if accessor.get("type") != kind or dtype.kind != letter or "sparse" in accessor or view.get("buffer") != 0:
         raise ValueError(f"the accessor {place} is of another kind than plain {kind} within the file")
     width = dtype.itemsize * _WIDTHS[kind]
