@@ -10,6 +10,7 @@ from pathlib import Path
 from .fit import CHECKPOINT
 from .fit_scan import CHECKPOINT_START
 from .names import SUMMARY
+from .surface_files import SURFACE_FILES
 
 try:
     import fcntl
@@ -18,7 +19,7 @@ except ImportError:  # Windows: folders are not locked there
 
 FIT = "fit.npz"
 """What `fitting.load` reads; it is put in place after all other files."""
-RESULTS = ("control.obj", "surface.ply", "report.json", "fit.html", "recipe.json", "fit.png", FIT)
+RESULTS = ("control.obj", *SURFACE_FILES, "report.json", "fit.html", "recipe.json", "fit.png", FIT)
 _UNFINISHED = ".unfinished-"  # the folders of `jaxsubdiv.files.replacing` and of `fill`
 _OURS = {*RESULTS, CHECKPOINT, CHECKPOINT_START, SUMMARY}
 

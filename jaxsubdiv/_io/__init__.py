@@ -18,9 +18,9 @@ from .._mesh import ControlMesh
 from ..errors import MeshError, name_rows
 from ..files import replacing
 from . import _arrays, _digitiser, _freesurfer, _gifti, _glb, _markups, _obj, _off, _pcd, _ply, _stl, _table, _vtk, _vtp
-from ._contents import Contents, VertexData, doubles, warn
+from ._contents import Contents, VertexData, doubles, library, warn
 
-__all__ = ["PointCloud", "Surface", "read_mesh", "read_points", "write_mesh"]
+__all__ = ["PointCloud", "Surface", "check_can_write", "read_mesh", "read_points", "write_mesh"]
 
 
 class PointCloud(NamedTuple):
@@ -59,24 +59,26 @@ class _Format(NamedTuple):
     read_points: Callable[[Path], Contents]
     write: Callable[[Path, Contents, VertexData], None] | None
     holds_data: bool = False
+    library: str | None = None
+    """Of the extra `io`, that writing takes."""
 
 
 _TABLE = _Format(None, _table.read, None)
 _MARKUPS = _Format(None, _markups.read, None)
 _DIGITISER = _Format(None, _digitiser.read, None)
 _FREESURFER = _Format(_freesurfer.read_binary, _freesurfer.read_binary, _freesurfer.write)
-_GIFTI_DATA = _Format(_gifti.read, _gifti.read_points, _gifti.write_data, holds_data=True)
+_GIFTI_DATA = _Format(_gifti.read, _gifti.read_points, _gifti.write_data, holds_data=True, library="nibabel.gifti")
 _FORMATS = {
     ".obj": _Format(_obj.read, _obj.read_points, _obj.write),
     ".ply": _Format(_ply.read, _ply.read_points, _ply.write, holds_data=True),
     ".off": _Format(_off.read, _off.read_points, _off.write),
     ".stl": _Format(_stl.read, _stl.read, _stl.write),
-    ".vtp": _Format(_vtp.read, _vtp.read_points, _vtk.write, holds_data=True),
+    ".vtp": _Format(_vtp.read, _vtp.read_points, _vtk.write, holds_data=True, library="pyvista"),
     ".vtu": _Format(_vtp.read, _vtp.read_points, None),
-    ".vtk": _Format(_vtk.read, _vtk.read_points, _vtk.write, holds_data=True),
+    ".vtk": _Format(_vtk.read, _vtk.read_points, _vtk.write, holds_data=True, library="pyvista"),
     ".glb": _Format(_glb.read, _glb.read, _glb.write, holds_data=True),
     ".shape.gii": _GIFTI_DATA,
-    ".gii": _Format(_gifti.read, _gifti.read_points, _gifti.write),
+    ".gii": _Format(_gifti.read, _gifti.read_points, _gifti.write, library="nibabel.gifti"),
     ".npz": _Format(_arrays.read_npz, _arrays.read_points, _arrays.write),
     ".asc": _Format(_freesurfer.read_text, _freesurfer.read_points, None),
     **dict.fromkeys((".surf", ".white", ".pial", ".inflated", ".smoothwm", ".orig", ".sphere"), _FREESURFER),
@@ -230,7 +232,8 @@ def write_mesh(
     warning, and another says by how much coordinates are rounded to single precision:
 
     - `.stl`: no normals, and no vertices that no face uses; not rounded.
-    - `.gii`: GIfTI. Vertex data go to a file of their own, `.shape.gii`, of the same mesh.
+    - `.gii`: GIfTI, as Connectome Workbench opens it: no normals, which it allows no room, and vertex data in a file of
+      their own, `.shape.gii`, written of the same mesh.
     - `.surf`, `.white`, `.pial` and the other names of FreeSurfer that `read_mesh` knows: no normals.
     - `.glb`: glTF, for web pages and slides. The vertices are in mm as they are here, in a node that takes mm with z up
       to the metres with y up that glTF has, x staying x, so that programs show the true size; `read_mesh` gives mm
@@ -255,19 +258,47 @@ def write_mesh(
     path = Path(path)
     if path.is_dir():
         raise MeshError(f"{path}: this is a folder. Name a file in it.")
-    format_ = _format(path)
-    if format_.write is None:
-        raise MeshError(
-            f"{path.name}: {path.suffix} files hold points without faces. Meshes go to {_suffixes('write')}."
-        )
+    format_, write = _writable(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, "the folder does not exist, create it first", str(path.parent))
     contents = _contents(path, mesh)
     data = _vertex_data(vertex_data or {}, len(contents.vertices))
-    if data and not format_.holds_data:
-        raise MeshError(f"{path.name}: {path.suffix} files hold no vertex data. Write {_suffixes('holds_data')}.")
+    if data:
+        _check_holds_data(path, format_)
     with replacing(path) as unfinished:
-        format_.write(unfinished, contents, data)
+        write(unfinished, contents, data)
+
+
+def check_can_write(path: str | os.PathLike[str], *, vertex_data: bool = False) -> None:
+    """See that `write_mesh` knows the suffix and has its library, before there is a mesh to write.
+
+    Args:
+        path: the file; neither it nor its folder need be there.
+        vertex_data: whether it is to hold some.
+
+    Raises:
+        MeshError: meshes are not written to files of this suffix, or not with vertex data.
+        ImportError: a library of the extra `io` is not installed.
+    """
+    path = Path(path)
+    format_, _ = _writable(path)
+    if vertex_data:
+        _check_holds_data(path, format_)
+    if format_.library is not None:
+        library(format_.library, f"{path.suffix} files")
+
+
+def _writable(path: Path) -> tuple[_Format, Callable[[Path, Contents, VertexData], None]]:
+    format_ = _format(path)
+    if format_.write is None:
+        held = "points without faces" if format_.read_mesh is None else "meshes that are only read"
+        raise MeshError(f"{path.name}: {path.suffix} files hold {held}. Meshes go to {_suffixes('write')}.")
+    return format_, format_.write
+
+
+def _check_holds_data(path: Path, format_: _Format) -> None:
+    if not format_.holds_data:
+        raise MeshError(f"{path.name}: {path.suffix} files hold no vertex data. Write {_suffixes('holds_data')}.")
 
 
 def _open(path: str | os.PathLike[str]) -> tuple[Path, _Format]:

@@ -6,7 +6,7 @@ Not read by nibabel: some numbers in a damaged file make it loop without end.
 import math
 import re
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -142,7 +142,10 @@ def _unknown(what: str) -> NoReturn:
 
 
 def write(path: Path, contents: Contents, data: VertexData) -> None:
-    """Triangles, in single precision: the standard knows no other. A warning says by how much it rounds."""
+    """Triangles, in single precision: the standard knows no other. A warning says by how much it rounds.
+
+    No normals: Connectome Workbench opens no surface with more arrays than two.
+    """
     gifti = library("nibabel.gifti", ".gii files")
     vertices = in_single_precision(path, "GIfTI", contents.vertices)
     triangles = triangles_only(path, "GIfTI", contents).astype(np.int32)
@@ -150,25 +153,23 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
         gifti.GiftiDataArray(vertices, "NIFTI_INTENT_POINTSET", "NIFTI_TYPE_FLOAT32"),
         gifti.GiftiDataArray(triangles, "NIFTI_INTENT_TRIANGLE", "NIFTI_TYPE_INT32"),
     ]
-    if contents.normals is not None:
-        arrays.append(_named_array(gifti, _NORMALS, contents.normals, "NIFTI_INTENT_VECTOR"))
     path.write_bytes(gifti.GiftiImage(darrays=arrays).to_bytes())
 
 
 def write_data(path: Path, contents: Contents, data: VertexData) -> None:
-    """The vertex data alone, an array each, as the measurements that go with a `.surf.gii`.
-
-    A file of its own, since Connectome Workbench opens no surface file with more arrays than the surface's two.
-    """
+    """The vertex data alone, an array each, as the measurements that go with a `.surf.gii`."""
     gifti = library("nibabel.gifti", ".gii files")
     if not data:
         raise MeshError(
             f"{path.name}: such files hold vertex data alone. Give some, or write the surface to .surf.gii."
         )
-    arrays = [_named_array(gifti, name, column, "NIFTI_INTENT_SHAPE") for name, column in data.items()]
+    arrays = [
+        gifti.GiftiDataArray(
+            column.astype(np.float32),
+            "NIFTI_INTENT_SHAPE",
+            "NIFTI_TYPE_FLOAT32",
+            meta=gifti.GiftiMetaData({"Name": name}),
+        )
+        for name, column in data.items()
+    ]
     path.write_bytes(gifti.GiftiImage(darrays=arrays).to_bytes())
-
-
-def _named_array(gifti: Any, name: str, values: Shaped[np.ndarray, "v *c"], intent: str) -> Any:
-    meta = gifti.GiftiMetaData({"Name": name})
-    return gifti.GiftiDataArray(values.astype(np.float32), intent, "NIFTI_TYPE_FLOAT32", meta=meta)
