@@ -1,5 +1,14 @@
 """Fit control meshes of `jaxsubdiv` surfaces to scanned point clouds."""
 
+from .image.boundary import scan_above as scan_above
+from .image.boundary import scan_of_label as scan_of_label
+from .image.boundary import suggest_settings as suggest_settings
+from .image.read import read_scan as read_scan
+from .image.read import read_volume as read_volume
+from .image.volume import Label as Label
+from .image.volume import Volume as Volume
+from .image.volume import choose_label as choose_label
+from .image.volume import find_labels as find_labels
 from .model.modes import Modes as Modes
 from .model.modes import shape_modes as shape_modes
 from .model.priors import Priors as Priors
@@ -41,7 +50,6 @@ from .scan.landmarks import match_landmarks as match_landmarks
 from .scan.landmarks import read_landmarks as read_landmarks
 from .scan.scan import Scan as Scan
 from .scan.scan import ScanError as ScanError
-from .scan.scan import read_scan as read_scan
 from .scan.search_closest import search_closest as search_closest
 from .solve.sparse_normal import SparseNormal as SparseNormal
 from .solve.sparse_normal import sparse_solver as sparse_solver

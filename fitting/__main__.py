@@ -23,6 +23,9 @@ from jaxsubdiv import SCHEMES
 from jaxsubdiv.console import in_colour, lasting_streams, plain_warnings, printable
 from jaxsubdiv.files import replacing
 
+from .image.boundary import suggest_settings
+from .image.read import is_image, read_labels, read_scan, read_volume, scan_of_volume, stem
+from .image.volume import Label, Volume
 from .model.limits import check_numbers
 from .model.priors.boundary import BoundaryCurve, boundary_of
 from .report.page import write_page
@@ -38,7 +41,7 @@ from .run.recipe import Recipe, load, load_recipe
 from .run.surface_files import FORMATS, check_formats, write_surface
 from .scan.example import Example, example
 from .scan.landmarks import Landmarks, match_landmarks, read_landmarks
-from .scan.scan import Scan, read_scan
+from .scan.scan import Scan
 from .start.parts import PartKind
 
 _EXAMPLE_NOISE = 3.0  # mm: the example starts from a control mesh that is wrong, to show that the fit mends it
@@ -58,6 +61,26 @@ _SUMMARY = (
 )
 
 
+class _Source(NamedTuple):
+    """Where a scan comes from."""
+
+    path: Path
+    label: Label | str | None = None
+    """Of a label map."""
+
+    @property
+    def title(self) -> str:
+        return self.path.name if not isinstance(self.label, Label) else f"{self.path.name}, {self.label}"
+
+    @property
+    def as_file(self) -> Path:
+        """A file of the same name with the label in it, which tells its folder from those of other labels."""
+        if self.label is None:
+            return self.path
+        word = str(self.label.name or self.label.value) if isinstance(self.label, Label) else self.label
+        return self.path.with_name(f"{stem(self.path)}_{''.join(c if c.isalnum() else '_' for c in word)}.scan")
+
+
 class _Job(NamedTuple):
     """One scan to fit."""
 
@@ -66,6 +89,7 @@ class _Job(NamedTuple):
     mesh: js.ControlMesh | None
     landmarks: Landmarks | None
     boundary: BoundaryCurve | None = None
+    image: Volume | None = None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -84,7 +108,7 @@ def _main(arguments: Sequence[str] | None) -> int:
     _keep_what_serves_again()
     try:
         _check_options(options)
-        scans, recipe = find_scans([Path(scan) for scan in options.scans]), _recipe(options)
+        scans, recipe = _sources(options), _recipe(options)
         check_formats(options.surface)
     except (ValueError, OSError, ImportError) as error:
         return _fail(error)
@@ -92,12 +116,25 @@ def _main(arguments: Sequence[str] | None) -> int:
         if len(scans) > 1:
             return _run_all(scans, options, recipe)
         scan = scans[0] if scans else None
-        folder = Path(options.output or f"fit_{scan.stem if scan else options.example}")
-        return _run(scan, folder, options, recipe, scan.name if scan else options.example)["status"]
+        folder = Path(options.output or f"fit_{stem(scan.as_file) if scan else options.example}")
+        return _run(scan, folder, options, recipe, scan.title if scan else options.example)["status"]
     except KeyboardInterrupt:
         skips = "; with --resume it skips the scans that are done" if len(scans) > 1 else ""
         print(f"\nstopped  the same command goes on from the last sweep{skips}", file=sys.stderr)
         return 130
+
+
+def _sources(options: argparse.Namespace) -> list[_Source]:
+    """Every scan of the files and folders that were named, one a label where all are asked for."""
+    sources: list[_Source] = []
+    for path in find_scans([Path(scan) for scan in options.scans]):
+        if not is_image(path):
+            sources.append(_Source(path))
+        elif options.label != "all":
+            sources.append(_Source(path, options.label))
+        else:
+            sources += [_Source(path, label) for label in read_labels(path)]
+    return sources
 
 
 def _check_options(options: argparse.Namespace) -> None:
@@ -130,16 +167,17 @@ def _recipe(options: argparse.Namespace) -> Recipe:
     return dataclasses.replace(recipe, scheme=scheme, **given)
 
 
-def _run_all(scans: list[Path], options: argparse.Namespace, recipe: Recipe) -> int:
+def _run_all(scans: list[_Source], options: argparse.Namespace, recipe: Recipe) -> int:
     """Every scan into a folder of its own, going on after a failure, and a table of all."""
     parent = Path(options.output or "fits")
-    counts = Counter(scan.name for scan in scans)
-    titles = [scan.name if counts[scan.name] == 1 else str(scan) for scan in scans]
+    counts = Counter(scan.title for scan in scans)
+    titles = [scan.title if counts[scan.title] == 1 else f"{scan.path}, {scan.title}" for scan in scans]
+    folders = name_folders([scan.as_file for scan in scans])
     rows, summary = [], ""
     try:
         with working_in(parent):
-            for number, (scan, title, name) in enumerate(zip(scans, titles, name_folders(scans), strict=True), 1):
-                print(f"\n[{number}/{len(scans)}] {scan}")
+            for number, (scan, title, name) in enumerate(zip(scans, titles, folders, strict=True), 1):
+                print(f"\n[{number}/{len(scans)}] {scan.path}{'' if scan.label is None else f', {scan.label}'}")
                 rows.append(_run(scan, parent / name, options, recipe, title))
                 summary = _as_csv(rows)
                 _write_summary(parent / SUMMARY, summary)  # after every scan: the run may be stopped
@@ -175,7 +213,7 @@ def _write_summary(path: Path, summary: str) -> None:
         _fail(error)
 
 
-def _run(scan: Path | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str) -> dict:
+def _run(scan: _Source | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str) -> dict:
     """One fit: its row of the summary, whose status is 0, 1 for one not to be trusted, 2 for one that failed."""
     title, began = printable(title), time.perf_counter()
     try:
@@ -189,11 +227,13 @@ def _run(scan: Path | None, folder: Path, options: argparse.Namespace, recipe: R
     return {"scan": title, "status": status, "seconds": f"{time.perf_counter() - began:.1f}"}
 
 
-def _fit(scan: Path | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str) -> dict:
+def _fit(scan: _Source | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str) -> dict:
     began = time.perf_counter()
     job = _inputs(scan, options)
     slices = "" if job.scan.slices is None else f" in {len(np.unique(job.scan.slices))} slices"
     print(f"scan     {job.scan.n_points:,} points{slices}, {_size(np.asarray(job.scan.points))}")
+    if job.image is not None:
+        recipe = _with_suggested(recipe, job.scan, options)
     marks = _marks(job, recipe, options)
     done = _done(folder, marks) if options.resume else None
     if done is not None:
@@ -271,7 +311,17 @@ def _done(folder: Path, marks: dict[str, str]) -> FitResult | None:
     return load(folder)
 
 
-def _inputs(scan: Path | None, options: argparse.Namespace) -> _Job:
+def _with_suggested(recipe: Recipe, scan: Scan, options: argparse.Namespace) -> Recipe:
+    """What suits an image, where neither the options nor a recipe say otherwise."""
+    given = {"faces": options.faces, "most_points": options.points}
+    if options.recipe is not None:
+        return recipe
+    return dataclasses.replace(
+        recipe, **{name: value for name, value in suggest_settings(scan).items() if given[name] is None}
+    )
+
+
+def _inputs(scan: _Source | None, options: argparse.Namespace) -> _Job:
     if scan is None:
         print(
             f"example  {options.example}, its control vertices moved by noise of {_EXAMPLE_NOISE:g} mm in each "
@@ -280,7 +330,12 @@ def _inputs(scan: Path | None, options: argparse.Namespace) -> _Job:
         points, mesh = example(options.example)
         noise = np.random.default_rng(0).normal(scale=_EXAMPLE_NOISE, size=mesh.vertices.shape)
         return _Job(options.example, points, js.ControlMesh(mesh.vertices + noise, mesh.faces, mesh.normals), None)
-    points = read_scan(scan, scale=options.scale, labels=options.labels)
+    file, image = scan.path, None
+    if is_image(file) and not options.labels:
+        image = read_volume(file, scale=options.scale)
+        points = scan_of_volume(image, file.name, label=scan.label, above=options.above)
+    else:
+        points = read_scan(file, scale=options.scale, labels=options.labels, label=options.label, above=options.above)
     mesh = None if options.control is None else js.read_mesh(options.control, scale=options.control_scale)
     landmarks = None
     if (options.landmarks is None) != (options.control_landmarks is None) or (options.landmarks and mesh is None):
@@ -298,10 +353,10 @@ def _inputs(scan: Path | None, options: argparse.Namespace) -> _Job:
         raise ValueError(f"{which} is that of a template: give --control MESH to --{which}.")
     boundary = None
     if options.boundary == "scan":
-        boundary = BoundaryCurve(boundary_of(js.read_mesh(scan, scale=options.scale, check=False)))
+        boundary = BoundaryCurve(boundary_of(js.read_mesh(file, scale=options.scale, check=False)))
     elif options.boundary is not None:
         boundary = BoundaryCurve(js.read_points(options.boundary, scale=options.scale).points)
-    return _Job(scan.name, points, mesh, landmarks, boundary)
+    return _Job(scan.title, points, mesh, landmarks, boundary, image)
 
 
 def _ending(found: ScanFit, off: float) -> str:
@@ -445,6 +500,10 @@ def _parser() -> argparse.ArgumentParser:
     add("--tolerance", type=float, metavar="MM", help="split the control mesh until the surface is this near the scan")
     add("--points", type=int, metavar="N", help="fit no more than so many, drawn at random; all of them are measured")
     add("--labels", nargs="+", metavar="WORD", default=[], help="only rows of a table whose label holds one of these")
+    add("--label", metavar="LABEL", help="of a label map: a value, a name, or `all`, a fit each; default: the only one")
+    add(
+        "--above", type=float, metavar="VALUE", help="of a grey image: the value at the surface, which is lower outside"
+    )
     add("--scale", type=float, default=1.0, help="multiplies the scan's coordinates; 1000 for metres")
     add("--control-scale", type=float, default=1.0, help="multiplies the control mesh's coordinates")
     add("--levels", type=int, help=f"levels of refinement, 1 to 8 (default: {Recipe.levels})")

@@ -4,6 +4,8 @@ import dataclasses
 import json
 import math
 
+from jaxsubdiv.frames import AXES
+
 from ..finding import Finding, Pose
 
 
@@ -44,6 +46,7 @@ class Report:
         trusted: whether nothing speaks against the fit.
         warnings: what does.
         pose: how the template was moved to the scan; None where there was none, or where it stayed.
+        frame: of all positions, RAS or LPS, where the scan's file says; else None.
         converged: whether the last sweeps left the fit where it was.
         reason: why not, in words; empty where it did.
         rms_start, rms: root mean square distance before and after.
@@ -74,6 +77,7 @@ class Report:
     trusted: bool
     warnings: list[Finding]
     pose: Pose | None
+    frame: str | None
     converged: bool
     reason: str
     sweeps: int
@@ -121,6 +125,8 @@ class Report:
         rows = [("fit", state)]
         if self.pose is not None:
             rows.append(("template", str(self.pose)))
+        if self.frame is not None:
+            rows.append(("positions", f"in mm, {self.frame} ({AXES[self.frame]})"))
         rows += [
             ("RMS distance", f"{self.rms:.3f} mm (from {self.rms_start:.3f} mm)"),
             ("mean / median", f"{self.mean:.3f} / {self.median:.3f} mm"),

@@ -192,6 +192,7 @@ class FitResult:
             trusted=self.trusted,
             warnings=self.warnings,
             pose=self.fit.origin.pose,
+            frame=self.fit.scan.frame,
             converged=bool(self.result == optx.RESULTS.successful),
             reason=_words(self.result),
             sweeps=len(self.rms) - 1,

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 import jaxsubdiv as js
 from jaxsubdiv.archives import read_arrays
 from jaxsubdiv.files import replacing
+from jaxsubdiv.frames import Frame
 
 from ..finding import Origin
 from ..model.pairing import Look, make_scene
@@ -89,6 +90,7 @@ def save_fit(
     arrays |= {f"shared_{name}": value for name, value in fit.y.shared.items()}
     for name in _OF_SCAN:
         arrays[f"scan_{name}"] = getattr(fit.scan, name)
+    arrays["frame"] = fit.scan.frame
     inputs = fit.inputs
     arrays["alike"] = inputs.get("alike")
     arrays["marks"] = None if marks is None else json.dumps(marks)
@@ -197,6 +199,13 @@ def _shifts_within(arrays: dict[str, np.ndarray], planes: SlicePlanes) -> Float[
     return np.einsum("sx,sjx->sj", arrays["shifts"], planes.planes)
 
 
+def _frame_of(arrays: dict[str, np.ndarray]) -> Frame | None:
+    frame = str(arrays["frame"]) if "frame" in arrays else None
+    if frame not in ("RAS", "LPS", None):
+        raise ValueError(f"'frame' is '{frame[:20]}', neither RAS nor LPS.")
+    return frame
+
+
 def _restore(arrays: dict[str, np.ndarray]) -> Fit:
     def on_device(name: str) -> Array:
         values = arrays[name]
@@ -208,7 +217,7 @@ def _restore(arrays: dict[str, np.ndarray]) -> Fit:
         raise ValueError(f"{settings.levels} levels of {mesh.n_faces} faces are more than a fit has. It is damaged.")
     topology = settings.topology(mesh)
     start = js.Control(on_device("template"), on_device("start_normals"))
-    scan = Scan(**{name: arrays.get(f"scan_{name}") for name in _OF_SCAN})
+    scan = Scan(**{name: arrays.get(f"scan_{name}") for name in _OF_SCAN}, frame=_frame_of(arrays))
     inputs: dict[str, Any] = {"alike": arrays.get("alike")}
     if "anchor_points" in arrays:
         inputs["landmarks"] = Anchors(*(on_device(f"anchor_{name}") for name in Anchors._fields))

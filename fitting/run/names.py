@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 
+from ..image.read import is_image, stem
+
 SUMMARY = "summary.csv"
 _SCAN_FILES = {".ply", ".xyz", ".csv", ".txt", ".npz", ".vtp", ".vtk", ".stl", ".obj", ".off", ".gii"}
 _LONGEST = 200  # bytes: file systems take 255, and a file that is being written has a longer name
@@ -32,7 +34,8 @@ def find_scans(given: Sequence[Path]) -> list[Path]:
 
 def _is_scan(file: Path) -> bool:
     # The summary lies here where the results of an earlier run went into the folder of its scans.
-    return file.suffix.lower() in _SCAN_FILES and file.name.lower() != SUMMARY and not file.is_dir()
+    known = file.suffix.lower() in _SCAN_FILES or is_image(file)
+    return known and file.name.lower() != SUMMARY and not file.is_dir()
 
 
 def name_folders(scans: Sequence[Path]) -> list[str]:
@@ -60,7 +63,7 @@ def name_folders(scans: Sequence[Path]) -> list[str]:
 def _choices(scan: Path) -> list[str]:
     """Names for one scan, from the shortest on."""
     parts = Path(os.path.abspath(scan)).parts[1:]
-    return [scan.stem] + ["_".join(parts[i:]) for i in reversed(range(len(parts)))]
+    return [stem(scan)] + ["_".join(parts[i:]) for i in reversed(range(len(parts)))]
 
 
 def _key(name: str) -> str:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 import jaxsubdiv as js
 from jaxsubdiv import strong_float
 from jaxsubdiv.errors import name_rows
+from jaxsubdiv.frames import Frame
 from jaxsubdiv.linalg import of_moderate_length
 
 _LABELS, _SLICE = ("label", "contour"), "slice"
@@ -74,6 +75,11 @@ class Scan(eqx.Module):
         faces: triangles between the points `[t, 3]`, or None. A control mesh made from the scan takes from them its
             parts, and which side is out where there are no normals; `fit` looks at the points alone, and a saved fit
             does not keep them.
+        frame: what the axes are, "RAS" (x to the right, y to the front, z up) or "LPS" (x to the left, y to the back, z
+            up); None where that is not known. Nothing is turned by it: landmarks and results name it.
+        view: of a scan that was seen in an image `[4, 4]`, takes positions to the unit cube that the image shows. A
+            control mesh made from the scan ends there, as an open surface: what lies beyond was not seen. A saved fit
+            does not keep it.
 
     Raises:
         ScanError: there is no point, a value is not finite, a weight is negative, a deviation is not positive, a
@@ -86,6 +92,8 @@ class Scan(eqx.Module):
     deviations: Float[Array, "p"] | None = eqx.field(converter=_optional, default=None)
     slices: Int[Array, "p"] | None = eqx.field(converter=_optional_whole, default=None)
     faces: Int[np.ndarray, "t 3"] | None = eqx.field(converter=_optional_faces, default=None)
+    frame: Frame | None = eqx.field(static=True, default=None)
+    view: Float[np.ndarray, "4 4"] | None = None
 
     def __check_init__(self):
         if self.points.ndim != 2 or self.points.shape[-1] != 3 or len(self.points) == 0:
@@ -147,13 +155,16 @@ class Scan(eqx.Module):
 
     def rows(self, chosen: Bool[np.ndarray, "p"] | Int[np.ndarray, "q"]) -> "Scan":
         """Some of the points, with all that is known of each."""
-        own = {name: value for name, value in vars(self).items() if name != "faces" and value is not None}
+        of_all = {"faces", "frame", "view"}
+        own = {name: value for name, value in vars(self).items() if name not in of_all and value is not None}
         faces = None
         if self.faces is not None:
             new = np.full(self.n_points, -1)
             new[chosen] = np.arange(len(new[chosen]))
             faces = new[self.faces][(new[self.faces] >= 0).all(axis=1)]
-        return Scan(**{name: value[chosen] for name, value in own.items()}, faces=faces)
+        return Scan(
+            **{name: value[chosen] for name, value in own.items()}, faces=faces, frame=self.frame, view=self.view
+        )
 
     def without_slices(self) -> "Scan":
         """The same points, each for itself."""
@@ -202,7 +213,7 @@ def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[st
 def _scan(path: Path, *parts: np.ndarray | None) -> Scan:
     try:
         with np.errstate(over="ignore"):  # what passes single precision is not finite, and told as such
-            return Scan(*parts)
+            return Scan(*parts)  # pyright: ignore[reportArgumentType]
     except ScanError as error:
         raise ScanError(f"{path.name}: {error}") from None
 

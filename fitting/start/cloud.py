@@ -44,6 +44,8 @@ class Cloud(NamedTuple):
     label: Int[np.ndarray, "p"] | None = None
     """Of scans with faces the component that each point lies in, where there are several large ones; -1 in a small one.
     None of all others."""
+    view: Float[np.ndarray, "4 4"] | None = None
+    """Of scans from images: see `Scan.view`."""
 
     @property
     def spacing(self) -> float:
@@ -72,7 +74,8 @@ def clean(scan: Scan) -> Cloud:
         _check_slices(points[rows], np.asarray(scan.slices)[rows])
     rows = rows[_even_rows(points[rows])]
     label = None if scan.faces is None else _large_components(scan.faces, points, used)
-    return clean_points(points[rows], None if given is None else given[rows], None if label is None else label[rows])
+    found = clean_points(points[rows], None if given is None else given[rows], None if label is None else label[rows])
+    return found._replace(view=scan.view)
 
 
 def _large_components(

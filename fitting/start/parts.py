@@ -64,7 +64,8 @@ def find_parts(cloud: Cloud, closed: bool | None) -> list[Part]:
         if beside.sum() < max(_MORE * n, LEAST_POINTS):
             break
         try:
-            rest = clean_points(rest.points[beside], rest.normals[beside] if rest.given else None)
+            left = clean_points(rest.points[beside], rest.normals[beside] if rest.given else None)
+            rest = left._replace(view=rest.view)
             found = reconstruct(rest, closed)
         except ScanError:
             break  # what is left is scattered

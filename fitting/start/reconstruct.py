@@ -26,6 +26,7 @@ _MADE_UP = 1.5
 _RIM = 0.45  # of that distance: at a rim the surface ends this far past the last points
 _OPEN = 0.2  # part of the closed surface that is made up: a face lacks half; a head with a hole of 80 mm up to 0.17
 _BRIDGED = 0.03  # part of the surface: smaller gaps of an open scan are bridged too
+_BEYOND = 0.002  # part of the surface: of a scan from an image, smaller ones past its end are bridged
 _SPECK = 0.01  # part of the surface: smaller pieces are none
 
 
@@ -92,6 +93,8 @@ def _pieces_of_surface(cloud: Cloud, implicit: Implicit, closed: bool | None) ->
 
 
 def _is_closed(cloud: Cloud, shut: Dense, tree: KDTree) -> bool:
+    if shut.areas[_beyond_view(cloud, shut)].sum() > _BEYOND * shut.areas.sum():
+        return False
     far = _made_up(shut, cloud, tree)[shut.faces].all(axis=1)
     return bool(shut.areas[far].sum() < _OPEN * shut.areas.sum())
 
@@ -136,12 +139,18 @@ def _made_up(dense: Dense, cloud: Cloud, tree: KDTree) -> Bool[np.ndarray, "v"]:
     return distance > _MADE_UP * np.maximum(cloud.reach[row], np.median(cloud.reach))
 
 
+def _beyond_view(cloud: Cloud, dense: Dense) -> Bool[np.ndarray, "t"]:
+    """Faces past the end of the image that the scan was made of."""
+    if cloud.view is None:
+        return np.zeros(len(dense.faces), bool)
+    there = dense.vertices[dense.faces].mean(axis=1) @ cloud.view[:3, :3].T + cloud.view[:3, 3]
+    return ((there < 0) | (there > 1)).any(axis=1)
+
+
 def _cut_back(dense: Dense, cloud: Cloud, tree: KDTree) -> Dense:
     """Without what is made up in large pieces; small gaps stay bridged."""
-    far = _made_up(dense, cloud, tree)
-    piece = _pieces(dense, np.asarray(far[dense.faces].all(axis=1)))
-    area = np.bincount(piece + 1, dense.areas)[1:]
-    gone = np.isin(piece, np.flatnonzero(area > _BRIDGED * dense.areas[piece < 0].sum()))
+    far, beyond = _made_up(dense, cloud, tree), _beyond_view(cloud, dense)
+    gone = _large(dense, np.asarray(far[dense.faces].all(axis=1)), _BRIDGED) | _large(dense, beyond, _BEYOND)
     away = np.zeros(len(dense.vertices), bool)
     away[dense.faces[gone]] = True
     if not away.any():
@@ -152,10 +161,18 @@ def _cut_back(dense: Dense, cloud: Cloud, tree: KDTree) -> Dense:
     to_gone = KDTree(dense.vertices[away]).query(dense.vertices, workers=-1)[0]
     out = away | ((to_gone < _MADE_UP * reach) & (distance > _RIM * reach + cloud.noise))
     kept = ~out[dense.faces].any(axis=1)
-    piece = _pieces(dense, ~kept)
-    area = np.bincount(piece + 1, dense.areas)[1:]
-    kept |= np.isin(piece, np.flatnonzero(area <= _BRIDGED * dense.areas[kept].sum()))
-    return Dense(dense.vertices, _without_pinches(dense.faces[kept]))
+    off = _large(dense, ~kept, _BRIDGED, always=gone)
+    return Dense(dense.vertices, _without_pinches(dense.faces[~off]))
+
+
+def _large(
+    dense: Dense, chosen: Bool[np.ndarray, "t"], share: float, always: Bool[np.ndarray, "t"] | None = None
+) -> Bool[np.ndarray, "t"]:
+    """Those of the chosen faces whose piece has more than a share of the area of the rest, or some of `always`."""
+    piece = _pieces(dense, chosen)
+    area = np.bincount(piece + 1, dense.areas, minlength=1)[1:]
+    large = np.flatnonzero(area > share * dense.areas[~chosen].sum())
+    return np.isin(piece, large if always is None else np.concatenate([large, piece[always]]))
 
 
 def _without_pinches(faces: Int[np.ndarray, "t 3"]) -> Int[np.ndarray, "s 3"]:

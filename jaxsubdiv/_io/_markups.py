@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import MeshError, name_rows
+from ..frames import AXES
 from ..tables import decode, read_table
 from ._contents import Contents, warn
 
 # Older versions number the frames.
 _FRAMES = {"0": "RAS", "1": "LPS", "ras": "RAS", "lps": "LPS", "scanner-xyz": "RAS"}
-_AXES = {"RAS": "right, anterior, superior", "LPS": "left, posterior, superior"}
 _COLUMNS = ["id", "x", "y", "z", "ow", "ox", "oy", "oz", "vis", "sel", "lock", "label", "desc", "associatedNodeID"]
 
 
@@ -34,7 +34,7 @@ def read(path: Path) -> Contents:
     if len(frames) > 1:
         raise MeshError(f"{path.name}: it holds control points in {' and '.join(frames)}. Save each frame for itself.")
     for frame in frames:
-        warn(path, f"positions are in {frame} ({_AXES[frame]}), as the file says; scan and template must be in it too.")
+        warn(path, f"positions are in {frame} ({AXES[frame]}), as the file says; scan and template must be in it too.")
     return Contents(np.array(marks.positions, np.float64).reshape(-1, 3), texts={"label": marks.labels})
 
 

@@ -1,0 +1,140 @@
+"""Voxels and where they lie; the labels that they name."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+from jaxsubdiv.frames import Frame
+
+from ..scan.scan import ScanError
+
+_MOST_LABELS = 4096  # whole numbers beyond it are grey values
+
+
+class Label(NamedTuple):
+    """A structure that a label map shows."""
+
+    value: int
+    """Of its voxels."""
+    name: str
+    """As the file names it; empty where it does not."""
+    layer: int = 0
+    """Of the volume's layers: those of structures that overlap differ."""
+
+    def __str__(self) -> str:
+        return f"{self.value} {self.name}".rstrip()
+
+
+class Volume(NamedTuple):
+    """An image or a label map."""
+
+    layers: tuple[Shaped[np.ndarray, "i j k"], ...]
+    """Values of the voxels; more than one array only where labels overlap."""
+    affine: Float[np.ndarray, "4 4"]
+    """Takes the index of a voxel to the position of its middle, in mm."""
+    frame: Frame | None
+    """What the axes of the positions are: x to the right, y to the front, z up, or x to the left, y to the back, z up.
+    None where the file does not say."""
+    labels: tuple[Label, ...] = ()
+    """Those that the file names."""
+
+    @property
+    def spacing(self) -> Float[np.ndarray, "3"]:
+        """From voxel to voxel along each index, in mm."""
+        return np.linalg.norm(self.affine[:3, :3], axis=0)
+
+    @property
+    def voxel_volume(self) -> float:
+        """In mm^3."""
+        return float(abs(np.linalg.det(self.affine[:3, :3])))
+
+    def positions(self, index: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+        """Where places between voxels lie, in mm."""
+        return index @ self.affine[:3, :3].T + self.affine[:3, 3]
+
+    def indices(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+        """Where positions in mm lie among the voxels."""
+        return (points - self.affine[:3, 3]) @ np.linalg.inv(self.affine[:3, :3]).T
+
+    def scaled(self, scale: float) -> "Volume":
+        """The same with positions in another unit."""
+        affine = self.affine.copy()
+        affine[:3] *= scale
+        return self._replace(affine=affine)
+
+
+class Found(NamedTuple):
+    """A label that has voxels."""
+
+    label: Label
+    voxels: int
+
+    def in_words(self, volume: Volume) -> str:
+        """`3 tibia (12.5 ml)`."""
+        return f"{self.label} ({self.voxels * volume.voxel_volume / 1000:.3g} ml)"
+
+
+def find_labels(volume: Volume) -> list[Found]:
+    """The labels that have voxels, in the order of layers and values; 0 is the background.
+
+    Raises:
+        ScanError: the values are no labels, or there is nothing but background.
+    """
+    names = {(label.layer, label.value): label for label in volume.labels}
+    found = []
+    for layer, values in enumerate(volume.layers):
+        for value, count in zip(*np.unique(_whole(values), return_counts=True), strict=True):
+            if value:
+                label = names.get((layer, int(value)), Label(int(value), "", layer))
+                found.append(Found(label, int(count)))
+    if not found:
+        raise ScanError("it has no label: all of its voxels are 0.")
+    return found
+
+
+def choose_label(volume: Volume, wanted: str | int | None) -> Label:
+    """The label of a value or a name, in capitals or not; None is the only one.
+
+    Raises:
+        ScanError: there is no such label, or there are several; the text lists them with their volumes.
+    """
+    found = find_labels(volume)
+    there = ", ".join(one.in_words(volume) for one in found)
+    if wanted is None:
+        if len(found) > 1:
+            raise ScanError(f"it has {len(found)} labels; choose by --label (`label=`) one, or all: {there}.")
+        return found[0].label
+    word = str(wanted).strip().casefold()
+    named = [one.label for one in found if word in (str(one.label.value), one.label.name.casefold())]
+    if not named:
+        raise ScanError(f"no voxel has the label '{wanted}'. It has: {there}.")
+    if len(named) > 1:
+        raise ScanError(
+            f"several labels are called '{wanted}': {', '.join(map(str, named))}. Give another of its names."
+        )
+    return named[0]
+
+
+def mask_of(volume: Volume, label: Label) -> Shaped[np.ndarray, "i j k"]:
+    """Which voxels have a label."""
+    return volume.layers[label.layer] == label.value
+
+
+def _whole(values: Shaped[np.ndarray, "i j k"]) -> Shaped[np.ndarray, "i j k"]:
+    if values.dtype.kind == "b":
+        return values.astype(np.uint8)
+    if values.dtype.kind == "f":
+        if not (np.isfinite(values).all() and np.array_equal(values, np.round(values))):
+            raise ScanError(
+                "its voxels are no whole numbers, so it is an image and no label map: give --above VALUE (`above=`), "
+                "which is the grey value of the surface."
+            )
+        values = values.astype(np.int64)
+    low, high = (int(values.min()), int(values.max())) if values.size else (0, 0)
+    if (high - low > _MOST_LABELS and len(np.unique(values)) > _MOST_LABELS) or low < 0:
+        raise ScanError(
+            f"its voxels go from {low} to {high}, so it is an image and no label map: give --above VALUE (`above=`), "
+            "which is the grey value of the surface."
+        )
+    return values
