@@ -24,8 +24,9 @@ from jaxsubdiv.console import in_colour, lasting_streams, plain_warnings, printa
 from jaxsubdiv.files import replacing
 
 from .image.boundary import suggest_settings
-from .image.read import is_image, read_labels, read_scan, read_volume, scan_of_volume, stem
-from .image.volume import Label, Volume
+from .image.read import Seen, is_image, read_labels, read_scan, read_seen, stem
+from .image.slices import Slice, cut_slices
+from .image.volume import Label
 from .model.limits import check_numbers
 from .model.priors.boundary import BoundaryCurve, boundary_of
 from .report.page import write_page
@@ -35,8 +36,8 @@ from .report.saved import read_marks, save_fit
 from .run.checkpoint import differing, marks_of
 from .run.fit import Sweep
 from .run.fit_scan import ScanFit, misfit
-from .run.folder import FIT, filling, is_unfinished, working_in
-from .run.names import SUMMARY, find_scans, name_folders
+from .run.folder import FIT, SUMMARY, filling, is_unfinished, working_in
+from .run.names import find_scans, name_folder, name_folders
 from .run.recipe import Recipe, load, load_recipe
 from .run.surface_files import FORMATS, check_formats, write_surface
 from .scan.example import Example, example
@@ -78,7 +79,8 @@ class _Source(NamedTuple):
         if self.label is None:
             return self.path
         word = str(self.label.name or self.label.value) if isinstance(self.label, Label) else self.label
-        return self.path.with_name(f"{stem(self.path)}_{''.join(c if c.isalnum() else '_' for c in word)}.scan")
+        name = f"{stem(self.path)}_{word}"
+        return self.path.with_name("".join(c if c.isalnum() or c in "-_ " else "_" for c in name))
 
 
 class _Job(NamedTuple):
@@ -89,7 +91,7 @@ class _Job(NamedTuple):
     mesh: js.ControlMesh | None
     landmarks: Landmarks | None
     boundary: BoundaryCurve | None = None
-    image: Volume | None = None
+    seen: Seen | None = None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -116,7 +118,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         if len(scans) > 1:
             return _run_all(scans, options, recipe)
         scan = scans[0] if scans else None
-        folder = Path(options.output or f"fit_{stem(scan.as_file) if scan else options.example}")
+        folder = Path(options.output or (name_folder(scan.as_file) if scan else f"fit_{options.example}"))
         return _run(scan, folder, options, recipe, scan.title if scan else options.example)["status"]
     except KeyboardInterrupt:
         skips = "; with --resume it skips the scans that are done" if len(scans) > 1 else ""
@@ -232,7 +234,7 @@ def _fit(scan: _Source | None, folder: Path, options: argparse.Namespace, recipe
     job = _inputs(scan, options)
     slices = "" if job.scan.slices is None else f" in {len(np.unique(job.scan.slices))} slices"
     print(f"scan     {job.scan.n_points:,} points{slices}, {_size(np.asarray(job.scan.points))}")
-    if job.image is not None:
+    if job.seen is not None:
         recipe = _with_suggested(recipe, job.scan, options)
     marks = _marks(job, recipe, options)
     done = _done(folder, marks) if options.resume else None
@@ -257,9 +259,16 @@ def _fit(scan: _Source | None, folder: Path, options: argparse.Namespace, recipe
     seconds = time.perf_counter() - began
     report, off = found.result.report(uncertainty=True), misfit(found.result)
     print(f"done     in {seconds:.1f} s{_ending(found, off)}\n\n{dataclasses.replace(report, warnings=[])}\n")
-    _save(folder, found, title, marks, options)
+    _save(folder, found, title, marks, _slices_of(job, found.result), options)
     _print_warnings(found.result)
     return _row(title, found.result, off, seconds)
+
+
+def _slices_of(job: _Job, result: FitResult) -> Sequence[Slice]:
+    """Of the image, where there was one."""
+    if job.seen is None:
+        return ()
+    return cut_slices(job.seen.volume, np.asarray(result.surface.vertices, np.float64), label=job.seen.label)
 
 
 def _print_warnings(result: FitResult) -> None:
@@ -330,10 +339,10 @@ def _inputs(scan: _Source | None, options: argparse.Namespace) -> _Job:
         points, mesh = example(options.example)
         noise = np.random.default_rng(0).normal(scale=_EXAMPLE_NOISE, size=mesh.vertices.shape)
         return _Job(options.example, points, js.ControlMesh(mesh.vertices + noise, mesh.faces, mesh.normals), None)
-    file, image = scan.path, None
+    file, seen = scan.path, None
     if is_image(file) and not options.labels:
-        image = read_volume(file, scale=options.scale)
-        points = scan_of_volume(image, file.name, label=scan.label, above=options.above)
+        seen = read_seen(file, scale=options.scale, label=scan.label, above=options.above)
+        points = seen.scan
     else:
         points = read_scan(file, scale=options.scale, labels=options.labels, label=options.label, above=options.above)
     mesh = None if options.control is None else js.read_mesh(options.control, scale=options.control_scale)
@@ -356,7 +365,7 @@ def _inputs(scan: _Source | None, options: argparse.Namespace) -> _Job:
         boundary = BoundaryCurve(boundary_of(js.read_mesh(file, scale=options.scale, check=False)))
     elif options.boundary is not None:
         boundary = BoundaryCurve(js.read_points(options.boundary, scale=options.scale).points)
-    return _Job(scan.title, points, mesh, landmarks, boundary, image)
+    return _Job(scan.title, points, mesh, landmarks, boundary, seen)
 
 
 def _ending(found: ScanFit, off: float) -> str:
@@ -365,7 +374,14 @@ def _ending(found: ScanFit, off: float) -> str:
     return f"; split {found.splits} times, {found.outcome}: the surface is {off:.3f} mm off the scan beside the noise"
 
 
-def _save(folder: Path, found: ScanFit, title: str, marks: dict[str, str], options: argparse.Namespace) -> None:
+def _save(
+    folder: Path,
+    found: ScanFit,
+    title: str,
+    marks: dict[str, str],
+    slices: Sequence[Slice],
+    options: argparse.Namespace,
+) -> None:
     """The fit as files, all of them in place of those of an earlier one, or none."""
     result = found.result
     with filling(folder) as new:
@@ -373,11 +389,11 @@ def _save(folder: Path, found: ScanFit, title: str, marks: dict[str, str], optio
         written = ["control.obj", *_write_surface(new, result, options)]
         written += ["report.json", "fit.html", "fit.npz", "recipe.json"]
         (new / "report.json").write_text(result.report(uncertainty=True).as_json() + "\n", encoding="utf-8")
-        write_page(new / "fit.html", result, title=title, start=found.start)
+        write_page(new / "fit.html", result, title=title, start=found.start, slices=slices)
         assert result.recipe is not None
         save_fit(new, result.fit, result.recipe, marks)
         try:
-            draw_fit(result, found.start, title=title).savefig(new / "fit.png")
+            draw_fit(result, found.start, title=title, slices=slices).savefig(new / "fit.png")
             written.append("fit.png")
         except ImportError as error:
             print(f"note     no picture: {error}")
@@ -480,7 +496,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("scans", nargs="*", metavar="SCAN", help="points or meshes, or folders of them: .ply .xyz .csv .txt .npz .vtp")
     add("--control", metavar="MESH", help="template of triangles and quads to start from; default: made from the scan")
-    add("-o", "--output", metavar="OUT", help="folder for the results (default: fit_ and the scan's name, or fits)")
+    add("-o", "--output", metavar="OUT", help="folder for the results (default: fit_ and the scan's file, or fits)")
     add("--faces", type=int, help=f"of the control mesh, where it is made (default: {Recipe.faces})")
     add("--kind", choices=("triangle", "quad"), help=f"of these faces (default: {Recipe.kind})")
     add("--closed", action=argparse.BooleanOptionalAction, help="whether the anatomy is; default: found from the scan")

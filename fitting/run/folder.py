@@ -9,7 +9,6 @@ from pathlib import Path
 
 from .fit import CHECKPOINT
 from .fit_scan import CHECKPOINT_START
-from .names import SUMMARY
 from .surface_files import SURFACE_FILES
 
 try:
@@ -17,11 +16,19 @@ try:
 except ImportError:  # Windows: folders are not locked there
     fcntl = None
 
+SUMMARY = "summary.csv"
 FIT = "fit.npz"
 """What `fitting.load` reads; it is put in place after all other files."""
-RESULTS = ("control.obj", *SURFACE_FILES, "report.json", "fit.html", "recipe.json", "fit.png", FIT)
+RESULTS = ("control.obj", "surface.ply", "report.json", "fit.html", "recipe.json", "fit.png", FIT)
+"""Of a fit without options."""
+_PLACED = (*SURFACE_FILES, *(name for name in RESULTS if name not in SURFACE_FILES))
 _UNFINISHED = ".unfinished-"  # the folders of `jaxsubdiv.files.replacing` and of `fill`
-_OURS = {*RESULTS, CHECKPOINT, CHECKPOINT_START, SUMMARY}
+_OURS = {*_PLACED, CHECKPOINT, CHECKPOINT_START, SUMMARY}
+
+
+def results_in(folder: Path) -> set[str]:
+    """Names of files that are results where they lie in this folder: of a fit only if it holds one, whole or not."""
+    return _OURS if (folder / FIT).exists() or is_unfinished(folder) else {SUMMARY}
 
 
 @contextmanager
@@ -95,7 +102,7 @@ def filling(folder: Path) -> Iterator[Path]:
     new = Path(tempfile.mkdtemp(prefix=_UNFINISHED, dir=folder))
     try:
         yield new
-        for name in RESULTS:
+        for name in _PLACED:
             if (new / name).exists():
                 os.replace(new / name, folder / name)
             else:
