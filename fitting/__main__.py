@@ -69,9 +69,10 @@ class _Source(NamedTuple):
     label: Label | str | None = None
     """Of a label map."""
 
-    @property
-    def title(self) -> str:
-        return self.path.name if not isinstance(self.label, Label) else f"{self.path.name}, {self.label}"
+    def title(self, whole: bool = False) -> str:
+        """The file's name, or all of its path, and the label where it is one of all."""
+        name = str(self.path) if whole else self.path.name
+        return f"{name}, {self.label}" if isinstance(self.label, Label) else name
 
     @property
     def as_file(self) -> Path:
@@ -119,7 +120,7 @@ def _main(arguments: Sequence[str] | None) -> int:
             return _run_all(scans, options, recipe)
         scan = scans[0] if scans else None
         folder = Path(options.output or (name_folder(scan.as_file) if scan else f"fit_{options.example}"))
-        return _run(scan, folder, options, recipe, scan.title if scan else options.example)["status"]
+        return _run(scan, folder, options, recipe, scan.title() if scan else options.example)["status"]
     except KeyboardInterrupt:
         skips = "; with --resume it skips the scans that are done" if len(scans) > 1 else ""
         print(f"\nstopped  the same command goes on from the last sweep{skips}", file=sys.stderr)
@@ -172,14 +173,14 @@ def _recipe(options: argparse.Namespace) -> Recipe:
 def _run_all(scans: list[_Source], options: argparse.Namespace, recipe: Recipe) -> int:
     """Every scan into a folder of its own, going on after a failure, and a table of all."""
     parent = Path(options.output or "fits")
-    counts = Counter(scan.title for scan in scans)
-    titles = [scan.title if counts[scan.title] == 1 else f"{scan.path}, {scan.title}" for scan in scans]
+    counts = Counter(scan.title() for scan in scans)
+    titles = [scan.title(whole=counts[scan.title()] > 1) for scan in scans]
     folders = name_folders([scan.as_file for scan in scans])
     rows, summary = [], ""
     try:
         with working_in(parent):
             for number, (scan, title, name) in enumerate(zip(scans, titles, folders, strict=True), 1):
-                print(f"\n[{number}/{len(scans)}] {scan.path}{'' if scan.label is None else f', {scan.label}'}")
+                print(f"\n[{number}/{len(scans)}] {scan.title(whole=True)}")
                 rows.append(_run(scan, parent / name, options, recipe, title))
                 summary = _as_csv(rows)
                 _write_summary(parent / SUMMARY, summary)  # after every scan: the run may be stopped
@@ -365,7 +366,7 @@ def _inputs(scan: _Source | None, options: argparse.Namespace) -> _Job:
         boundary = BoundaryCurve(boundary_of(js.read_mesh(file, scale=options.scale, check=False)))
     elif options.boundary is not None:
         boundary = BoundaryCurve(js.read_points(options.boundary, scale=options.scale).points)
-    return _Job(scan.title, points, mesh, landmarks, boundary, seen)
+    return _Job(scan.title(), points, mesh, landmarks, boundary, seen)
 
 
 def _ending(found: ScanFit, off: float) -> str:
