@@ -9,6 +9,7 @@ from pathlib import Path
 
 from .fit import CHECKPOINT
 from .fit_scan import CHECKPOINT_START
+from .surface_files import SURFACE_FILES
 
 try:
     import fcntl
@@ -19,8 +20,10 @@ SUMMARY = "summary.csv"
 FIT = "fit.npz"
 """What `fitting.load` reads; it is put in place after all other files."""
 RESULTS = ("control.obj", "surface.ply", "report.json", "fit.html", "recipe.json", "fit.png", FIT)
+"""Of a fit without options."""
+_PLACED = (*SURFACE_FILES, *(name for name in RESULTS if name not in SURFACE_FILES))
 _UNFINISHED = ".unfinished-"  # the folders of `jaxsubdiv.files.replacing` and of `fill`
-_OURS = {*RESULTS, CHECKPOINT, CHECKPOINT_START, SUMMARY}
+_OURS = {*_PLACED, CHECKPOINT, CHECKPOINT_START, SUMMARY}
 
 
 def results_in(folder: Path) -> set[str]:
@@ -99,7 +102,7 @@ def filling(folder: Path) -> Iterator[Path]:
     new = Path(tempfile.mkdtemp(prefix=_UNFINISHED, dir=folder))
     try:
         yield new
-        for name in RESULTS:
+        for name in _PLACED:
             if (new / name).exists():
                 os.replace(new / name, folder / name)
             else:
