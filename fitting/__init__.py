@@ -51,6 +51,8 @@ from .scan.example import example as example
 from .scan.landmarks import Landmarks as Landmarks
 from .scan.landmarks import match_landmarks as match_landmarks
 from .scan.landmarks import read_landmarks as read_landmarks
+from .scan.regions import RegionMatch as RegionMatch
+from .scan.regions import match_regions as match_regions
 from .scan.scan import Scan as Scan
 from .scan.scan import ScanError as ScanError
 from .scan.search_closest import search_closest as search_closest

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Shaped
 
 from .. import notices
+from .._regions import Regions
 from ..errors import MeshError, name_rows
 
 
@@ -25,6 +26,8 @@ class Contents(NamedTuple):
     """Columns of text beside the points, by heading."""
     usual_unit: tuple[str, float] | None = None
     """The unit that programs of the format write, and the scale that takes it to mm; None where it says nothing."""
+    regions: Regions | None = None
+    """Of the faces, triangles first."""
 
 
 VertexData = Mapping[str, Shaped[np.ndarray, "v"]]
