@@ -1,6 +1,6 @@
 """Regions: which of a few named parts each face of a mesh, or each point of a scan, belongs to."""
 
-from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -63,7 +63,7 @@ class Regions(eqx.Module):
         return np.bincount(self.rows[self.rows >= 0], minlength=len(self.names))
 
 
-def as_regions(value: "Regions | Sequence[str] | None") -> Regions | None:
+def as_regions(value: Any) -> Regions | None:
     """Regions as they are, or from a name a row, where an empty one is none."""
     if value is None or isinstance(value, Regions):
         return value

@@ -94,7 +94,7 @@ def match_regions(scan: Scan, mesh: js.ControlMesh, groups: Groups | None = None
 
     Raises:
         ValueError: a given group is none of the mesh, or groups are given and the mesh has none.
-        ScanError: groups are given and the scan has no labels, or none of these.
+        ScanError: groups are given and the scan has no labels.
     """
     if mesh.regions is None:
         if groups:
@@ -102,9 +102,11 @@ def match_regions(scan: Scan, mesh: js.ControlMesh, groups: Groups | None = None
         return None
     given = _given(groups or {}, mesh.regions)
     labels = () if scan.regions is None else scan.regions.names
-    own = {label.casefold() for label in labels}
-    if groups and not own.intersection(given):
-        raise ScanError(f"`regions` are given for {_listed(groups)}, but the labels of the scan are {_listed(labels)}.")
+    if groups and not labels:
+        raise ScanError(
+            f"`regions` are given for {_listed(groups)}, but the scan has no labels. A table has them in a column `label` "
+            "or `contour`."
+        )
     counts = dict(zip(mesh.regions.names, mesh.regions.counts(), strict=True))
     there = [name for name in mesh.regions.names if counts[name]]
     found = {label: given.get(label.casefold(), _groups_of(label, there)) for label in labels}
