@@ -104,8 +104,8 @@ def match_regions(scan: Scan, mesh: js.ControlMesh, groups: Groups | None = None
     labels = () if scan.regions is None else scan.regions.names
     if groups and not labels:
         raise ScanError(
-            f"`regions` are given for {_listed(groups)}, but the scan has no labels. A table has them in a column `label` "
-            "or `contour`."
+            f"`regions` are given for {_listed(groups)}, but the scan has no labels. A table has them in a column "
+            "`label` or `contour`."
         )
     counts = dict(zip(mesh.regions.names, mesh.regions.counts(), strict=True))
     there = [name for name in mesh.regions.names if counts[name]]
