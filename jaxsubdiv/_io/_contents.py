@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped
 
 from ..errors import MeshError, name_rows
+from ..frames import Frame
 
 
 class Contents(NamedTuple):
@@ -23,6 +24,8 @@ class Contents(NamedTuple):
     weights: Float[np.ndarray, "v"] | None = None
     texts: Mapping[str, list[str]] = MappingProxyType({})
     """Columns of text beside the points, by heading."""
+    frame: Frame | None = None
+    """What the axes are, where that is known."""
 
 
 VertexData = Mapping[str, Shaped[np.ndarray, "v"]]

@@ -12,6 +12,7 @@ from jaxtyping import Int, Shaped
 
 from ..errors import MeshError, name_rows
 from ._contents import Contents, VertexData, by_size, check_polygons, doubles, library
+from ._frame import space_words
 from ._text import parse_numbers, token_starts
 
 _NORMALS = "Normals"
@@ -157,6 +158,7 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
     else:
         writer = library("vtkmodules.vtkIOLegacy", ".vtk files").vtkPolyDataWriter()
         writer.SetFileTypeToBinary()
+        writer.SetHeader(f"jaxsubdiv {space_words(contents.frame)}".strip())
     writer.SetInputData(polydata)
     writer.SetFileName(str(path))
     done, messages = _watch(writer.Write)
