@@ -9,7 +9,7 @@ from pathlib import Path
 
 from .fit import CHECKPOINT
 from .fit_scan import CHECKPOINT_START
-from .names import SUMMARY
+from .names import ALL_LANDMARKS, SUMMARY
 
 try:
     import fcntl
@@ -18,9 +18,11 @@ except ImportError:  # Windows: folders are not locked there
 
 FIT = "fit.npz"
 """What `fitting.load` reads; it is put in place after all other files."""
-RESULTS = ("control.obj", "surface.ply", "report.json", "fit.html", "recipe.json", "fit.png", FIT)
+LANDMARKS, CARRIED = "landmarks.mrk.json", "landmarks.csv"
+"""Landmarks that were carried to the fit, for 3D Slicer and as a table."""
+RESULTS = ("control.obj", "surface.ply", "report.json", "fit.html", "recipe.json", "fit.png", LANDMARKS, CARRIED, FIT)
 _UNFINISHED = ".unfinished-"  # the folders of `jaxsubdiv.files.replacing` and of `fill`
-_OURS = {*RESULTS, CHECKPOINT, CHECKPOINT_START, SUMMARY}
+_OURS = {*RESULTS, CHECKPOINT, CHECKPOINT_START, SUMMARY, ALL_LANDMARKS}
 
 
 @contextmanager

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from ..image.read import is_image, stem
 
-SUMMARY = "summary.csv"
+SUMMARY, ALL_LANDMARKS = "summary.csv", "landmarks.csv"
+"""Tables of all scans."""
 _SCAN_FILES = {".ply", ".xyz", ".csv", ".txt", ".npz", ".vtp", ".vtk", ".stl", ".obj", ".off", ".gii"}
 _LONGEST = 200  # bytes: file systems take 255, and a file that is being written has a longer name
 
@@ -33,9 +34,9 @@ def find_scans(given: Sequence[Path]) -> list[Path]:
 
 
 def _is_scan(file: Path) -> bool:
-    # The summary lies here where the results of an earlier run went into the folder of its scans.
+    # The tables lie here where the results of an earlier run went into the folder of its scans.
     known = file.suffix.lower() in _SCAN_FILES or is_image(file)
-    return known and file.name.lower() != SUMMARY and not file.is_dir()
+    return known and file.name.lower() not in (SUMMARY, ALL_LANDMARKS) and not file.is_dir()
 
 
 def name_folders(scans: Sequence[Path]) -> list[str]:
@@ -72,8 +73,8 @@ def _key(name: str) -> str:
 
 
 def _bad(name: str) -> bool:
-    """Whether a folder cannot have the name, as `..`, or not beside the summary."""
-    return _key(name) in ("", SUMMARY) or len(os.fsencode(name)) > _LONGEST
+    """Whether a folder cannot have the name, as `..`, or not beside the tables of all."""
+    return _key(name) in ("", SUMMARY, ALL_LANDMARKS) or len(os.fsencode(name)) > _LONGEST
 
 
 def _number(names: list[str]) -> list[str]:
