@@ -5,6 +5,8 @@ from .image.boundary import scan_of_label as scan_of_label
 from .image.boundary import suggest_settings as suggest_settings
 from .image.read import read_scan as read_scan
 from .image.read import read_volume as read_volume
+from .image.slices import Slice as Slice
+from .image.slices import cut_slices as cut_slices
 from .image.volume import Label as Label
 from .image.volume import Volume as Volume
 from .image.volume import choose_label as choose_label
@@ -29,6 +31,7 @@ from .model.unknowns import Free as Free
 from .report.cohort import Cohort as Cohort
 from .report.page import write_page as write_page
 from .report.picture import draw_fit as draw_fit
+from .report.picture import draw_slices as draw_slices
 from .report.posterior import Uncertainty as Uncertainty
 from .report.refit import Refit as Refit
 from .report.report import Report as Report

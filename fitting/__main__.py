@@ -25,8 +25,9 @@ from jaxsubdiv.files import replacing
 from jaxsubdiv.frames import Frame, in_frame
 
 from .image.boundary import suggest_settings
-from .image.read import is_image, read_labels, read_scan, read_volume, scan_of_volume, stem
-from .image.volume import Label, Volume
+from .image.read import Seen, is_image, read_labels, read_scan, read_seen, stem
+from .image.slices import Slice, cut_slices
+from .image.volume import Label
 from .model.limits import check_numbers
 from .model.priors.boundary import BoundaryCurve, boundary_of
 from .report.page import write_page
@@ -37,8 +38,8 @@ from .run.carry import carry_landmarks
 from .run.checkpoint import differing, marks_of
 from .run.fit import Sweep
 from .run.fit_scan import ScanFit, misfit
-from .run.folder import CARRIED, FIT, LANDMARKS, filling, is_unfinished, working_in
-from .run.names import ALL_LANDMARKS, SUMMARY, find_scans, name_folders
+from .run.folder import CARRIED, FIT, LANDMARKS, SUMMARY, filling, is_unfinished, working_in
+from .run.names import find_scans, name_folder, name_folders
 from .run.recipe import Recipe, load, load_recipe
 from .scan.example import Example, example
 from .scan.landmarks import (
@@ -86,7 +87,8 @@ class _Source(NamedTuple):
         if self.label is None:
             return self.path
         word = str(self.label.name or self.label.value) if isinstance(self.label, Label) else self.label
-        return self.path.with_name(f"{stem(self.path)}_{''.join(c if c.isalnum() else '_' for c in word)}.scan")
+        name = f"{stem(self.path)}_{word}"
+        return self.path.with_name("".join(c if c.isalnum() or c in "-_ " else "_" for c in name))
 
 
 class _Job(NamedTuple):
@@ -97,7 +99,7 @@ class _Job(NamedTuple):
     mesh: js.ControlMesh | None
     landmarks: Landmarks | None
     boundary: BoundaryCurve | None = None
-    image: Volume | None = None
+    seen: Seen | None = None
     carried: FramedLandmarks | None = None
     """Places on the control mesh, to be carried to the fit."""
 
@@ -127,7 +129,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         if len(scans) > 1:
             return _run_all(scans, options, recipe)
         scan = scans[0] if scans else None
-        folder = Path(options.output or f"fit_{stem(scan.as_file) if scan else options.example}")
+        folder = Path(options.output or (name_folder(scan.as_file) if scan else f"fit_{options.example}"))
         return _run(scan, folder, options, recipe, scan.title if scan else options.example)["status"]
     except KeyboardInterrupt:
         skips = "; with --resume it skips the scans that are done" if len(scans) > 1 else ""
@@ -161,7 +163,7 @@ def _check_options(options: argparse.Namespace) -> None:
 
 def _landmark_files(options: argparse.Namespace) -> list[str]:
     """Where the named output folder gets landmarks."""
-    return [os.path.abspath(Path(options.output or "fits") / name) for name in (LANDMARKS, CARRIED, ALL_LANDMARKS)]
+    return [os.path.abspath(Path(options.output or "fits") / name) for name in (LANDMARKS, CARRIED)]
 
 
 def _recipe(options: argparse.Namespace) -> Recipe:
@@ -201,10 +203,10 @@ def _run_all(scans: list[_Source], options: argparse.Namespace, recipe: Recipe) 
                 _write_table(parent / SUMMARY, summary)  # after every scan: the run may be stopped
                 landmarks += _landmark_rows(parent / name / CARRIED, title) if options.carry else []
                 if landmarks:
-                    _write_table(parent / ALL_LANDMARKS, _as_csv(landmarks, tuple(landmarks[0])))
+                    _write_table(parent / CARRIED, _as_csv(landmarks, tuple(landmarks[0])))
     except (ValueError, OSError) as error:
         return _fail(error)
-    print(f"\n{summary}\nwrote    {parent / SUMMARY}{f' and {ALL_LANDMARKS}' if landmarks else ''}")
+    print(f"\n{summary}\nwrote    {parent / SUMMARY}{f' and {CARRIED}' if landmarks else ''}")
     failed = [row["scan"] for row in rows if row["status"]]
     if failed:
         print(f"{len(failed)} of {len(rows)} did not end well: {', '.join(failed)}", file=sys.stderr)
@@ -261,7 +263,7 @@ def _fit(scan: _Source | None, folder: Path, options: argparse.Namespace, recipe
     job = _inputs(scan, options, recipe)
     slices = "" if job.scan.slices is None else f" in {len(np.unique(job.scan.slices))} slices"
     print(f"scan     {job.scan.n_points:,} points{slices}, {_size(np.asarray(job.scan.points))}")
-    if job.image is not None:
+    if job.seen is not None:
         recipe = _with_suggested(recipe, job.scan, options)
     marks = _marks(job, recipe)
     done = _done(folder, marks) if options.resume else None
@@ -289,6 +291,13 @@ def _fit(scan: _Source | None, folder: Path, options: argparse.Namespace, recipe
     _save(folder, found, title, marks, job)
     _print_warnings(found.result)
     return _row(title, found.result, off, seconds)
+
+
+def _slices_of(job: _Job, result: FitResult) -> Sequence[Slice]:
+    """Of the image, where there was one."""
+    if job.seen is None:
+        return ()
+    return cut_slices(job.seen.volume, np.asarray(result.surface.vertices, np.float64), label=job.seen.label)
 
 
 def _print_warnings(result: FitResult) -> None:
@@ -358,10 +367,10 @@ def _inputs(scan: _Source | None, options: argparse.Namespace, recipe: Recipe) -
         points, mesh = example(options.example)
         noise = np.random.default_rng(0).normal(scale=_EXAMPLE_NOISE, size=mesh.vertices.shape)
         return _Job(options.example, points, js.ControlMesh(mesh.vertices + noise, mesh.faces, mesh.normals), None)
-    file, image = scan.path, None
+    file, seen = scan.path, None
     if is_image(file) and not options.labels:
-        image = read_volume(file, scale=options.scale)
-        points = scan_of_volume(image, file.name, label=scan.label, above=options.above)
+        seen = read_seen(file, scale=options.scale, label=scan.label, above=options.above)
+        points = seen.scan
     else:
         points = read_scan(file, scale=options.scale, labels=options.labels, label=options.label, above=options.above)
     mesh, of_mesh = _template(options, recipe, points.frame)
@@ -386,7 +395,7 @@ def _inputs(scan: _Source | None, options: argparse.Namespace, recipe: Recipe) -
         boundary = BoundaryCurve(boundary_of(js.read_mesh(file, scale=options.scale, check=False)))
     elif options.boundary is not None:
         boundary = BoundaryCurve(js.read_points(options.boundary, scale=options.scale).points)
-    return _Job(scan.title, points, mesh, landmarks, boundary, image, carried)
+    return _Job(scan.title, points, mesh, landmarks, boundary, seen, carried)
 
 
 def _template(
@@ -414,6 +423,7 @@ def _ending(found: ScanFit, off: float) -> str:
 def _save(folder: Path, found: ScanFit, title: str, marks: dict[str, str], job: _Job) -> None:
     """The fit as files, all of them in place of those of an earlier one, or none."""
     result, frame = found.result, job.scan.frame or (job.carried.frame if job.carried is not None else None)
+    slices = _slices_of(job, result)
     written = ["control.obj", "surface.ply", "report.json", "fit.html", "fit.npz", "recipe.json"]
     with filling(folder) as new:
         js.write_mesh(new / "control.obj", result.control_mesh, frame=frame)
@@ -425,11 +435,11 @@ def _save(folder: Path, found: ScanFit, title: str, marks: dict[str, str], job: 
                 write_landmarks(new / name, there.positions, frame=frame, deviations=there.deviations)
                 written.append(name)
         (new / "report.json").write_text(result.report(uncertainty=True).as_json() + "\n", encoding="utf-8")
-        write_page(new / "fit.html", result, title=title, start=found.start)
+        write_page(new / "fit.html", result, title=title, start=found.start, slices=slices)
         assert result.recipe is not None
         save_fit(new, result.fit, result.recipe, marks)
         try:
-            draw_fit(result, found.start, title=title).savefig(new / "fit.png")
+            draw_fit(result, found.start, title=title, slices=slices).savefig(new / "fit.png")
             written.append("fit.png")
         except ImportError as error:
             print(f"note     no picture: {error}")
@@ -523,14 +533,14 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("scans", nargs="*", metavar="SCAN", help="points or meshes, or folders of them: .ply .xyz .csv .txt .npz .vtp")
     add("--control", metavar="MESH", help="template of triangles and quads to start from; default: made from the scan")
-    add("-o", "--output", metavar="OUT", help="folder for the results (default: fit_ and the scan's name, or fits)")
+    add("-o", "--output", metavar="OUT", help="folder for the results (default: fit_ and the scan's file, or fits)")
     add("--faces", type=int, help=f"of the control mesh, where it is made (default: {Recipe.faces})")
     add("--kind", choices=("triangle", "quad"), help=f"of these faces (default: {Recipe.kind})")
     add("--closed", action=argparse.BooleanOptionalAction, help="whether the anatomy is; default: found from the scan")
     add("--part", choices=get_args(PartKind), help="of a scan that shows several; default: the largest, with a warning")
     add("--mirror", action="store_true", help="fit the template's mirror image: that of the other side of the body")
     add("--align", choices=("similarity", "rigid", "affine", "none"), help=f"of the template (default: {Recipe.pose})")
-    add("--landmarks", metavar="FILE", help="named places on the scan, .mrk.json .json .csv .tsv .fcsv; see next")
+    add("--landmarks", metavar="FILE", help="named places on the scan: .mrk.json .json .csv .tsv .fcsv")
     add("--control-landmarks", metavar="FILE", help="the same names on the template")
     add(
         "--carry",

@@ -16,20 +16,24 @@ from ._refine import refine
 from ._scheme.base import AbstractScheme, OldNormals
 from ._scheme.interpolating import Interpolating, Twist
 from ._topology import MAX_LEVELS, build_topology
-from .console import plain_warnings
+from .console import lasting_streams, plain_warnings
 from .errors import MeshError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns its exit status: 0, or 2 where the input or the arguments cannot be used."""
+    with lasting_streams(), plain_warnings():
+        return _main(arguments)
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     words = sys.argv[1:] if arguments is None else list(arguments)
     comparing = words[:1] == ["compare"]
     options = _compare.parser().parse_args(words[1:]) if comparing else _parser().parse_args(words)
     # A file is refined once: twice the digits cost nothing that one would notice.
     jax.config.update("jax_enable_x64", True)
     try:
-        with plain_warnings():
-            return _compare.run(options) if comparing else _run(options)
+        return _compare.run(options) if comparing else _run(options)
     except (MeshError, OSError, ValueError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

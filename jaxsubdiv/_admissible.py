@@ -1,13 +1,12 @@
 """How far control normals are from folding the surface."""
 
-import warnings
-
 import numpy as np
 from jaxtyping import Float
 
 from ._control import Control
 from ._mesh import ControlMesh
 from .errors import name_rows
+from .notices import warn
 
 
 def admissible_margin(mesh: ControlMesh, control: Control | None = None) -> Float[np.ndarray, "v"]:
@@ -43,9 +42,8 @@ def warn_of_folds(mesh: ControlMesh, control: Control | None = None) -> None:
     bad = np.flatnonzero(margin < -1e-6)
     if len(bad):
         worst = bad[np.argsort(margin[bad])]
-        warnings.warn(
+        warn(
             f"the normals of vertices {name_rows(worst)} point to the back of one of their faces (margin down to "
             f"{margin.min():.2f}): the surface may fold there. Turn them, leave them out so that they are computed "
             'from the faces, or refine with old_normals="recompute".',
-            stacklevel=3,
         )

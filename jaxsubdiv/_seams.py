@@ -1,6 +1,5 @@
 """Several normals at one vertex: a control mesh cut open along its creases, and the seams that hold it together."""
 
-import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +10,7 @@ from ._mesh import ControlMesh, vector_areas
 from ._stage import Sides, Stage, numbers, sides_of, stage_of
 from .errors import MeshError, name_rows
 from .half_edges import Faces
+from .notices import warn
 
 
 class SplitMesh(NamedTuple):
@@ -59,11 +59,10 @@ def split_normals(mesh: ControlMesh, edges: Numbers | None = None, *, angle: flo
     left, right = stage.left[inside], stage.right[inside]
     joined = (corner[left] == corner[sides.next[right]]) & (corner[right] == corner[sides.next[left]])
     if joined.any():
-        warnings.warn(
+        warn(
             f"creases {name_rows(f'({a}, {b})' for a, b in stage.edges[inside[joined]])} end inside the surface at "
             "both ends, where there is one normal: they stay smooth. A crease has two edges or more, or starts at a "
             "boundary or another crease.",
-            stacklevel=2,
         )
     faces: Faces = {}
     first = 0

@@ -1,12 +1,16 @@
 """Settings of every test: double precision, no silent promotion, shapes checked while the code runs."""
 
 import itertools
+import os
 from pathlib import Path
 
 import jax
 import jaxtyping
 import pytest
 
+# XLA's newer emitters take three times as long to compile, and every program here is compiled to run a few times. Given
+# before the first program is compiled, and in the environment, so that commands in processes of their own have it too.
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_disable_most_optimizations", True)  # programs that run a few times take longer to be made fast
 jax.config.update("jax_numpy_rank_promotion", "raise")

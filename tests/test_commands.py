@@ -448,8 +448,8 @@ def test_resume_skips_what_is_done_and_goes_on_with_the_rest(files, capsys, monk
 def test_fit_that_did_not_converge_is_status_1_and_written_all_the_same(files, capsys):
     assert run(fit, "scan.xyz", *GIVEN, "--max-sweeps", 2) == 1
     assert "NOT CONVERGED" in capsys.readouterr().out
-    assert names(files / "fit_scan") == RESULTS
-    assert json.loads((files / "fit_scan" / "report.json").read_text())["converged"] is False
+    assert names(files / "fit_scan.xyz") == RESULTS
+    assert json.loads((files / "fit_scan.xyz" / "report.json").read_text())["converged"] is False
 
 
 def test_scales_bring_both_files_to_mm(files):

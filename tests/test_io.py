@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from meshes import cube, grid, mixed_closed, octahedron, two_components
 
-from jaxsubdiv import _io
+from jaxsubdiv import _io, tables
 from jaxsubdiv._io import PointCloud, read_mesh, read_points, write_mesh
 from jaxsubdiv._mesh import ControlMesh
 from jaxsubdiv.errors import MeshError
@@ -623,6 +623,45 @@ def test_point_tables_keep_every_digit(rows):
             assert (cloud.normals is None) == (not rows[:, 3:].any())
             if cloud.normals is not None:
                 np.testing.assert_array_equal(cloud.normals, rows[:, 3:])
+
+
+CELLS = [
+    *("1", "+2.", "-.5", "1e3", "nan", "-inf", "1 ", "0x10", "1_0", "1d5", "1,5", "", " ", "\t", "\x0c3", "3\x0b", "."),
+    *("1e400", "1e-400", "4\x00", "\x1c5", "abc", "1+2j", "1e", "--1", "1.#QNAN", "-", "NA", "7\r", '"8"', "9#", "//"),
+]
+
+
+def test_plain_tables_are_read_as_any_others(tmp_path, monkeypatch):
+    read_plain, n_plain = tables._plain_numbers, 0
+
+    def outcome() -> tuple:
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            try:
+                contents = _io._table.read(tmp_path / "a.csv")
+                words = None
+            except MeshError as error:
+                contents, words = _io._table.Contents(np.zeros((0, 3))), str(error)
+        arrays = [None if values is None else values.tolist() for values in (*contents[:1], *contents[2:4])]
+        return repr(arrays), contents.texts, words, [str(warning.message) for warning in told]
+
+    for seed in range(400):
+        rng = np.random.default_rng(seed)
+        n, delimiter = rng.integers(3, 8), rng.choice([" ", ",", ";", "\t", "  ", ", "])
+        rows = [[f"{value:.3g}" for value in row] for row in rng.normal(size=(rng.integers(1, 5), n))]
+        if seed % 3:
+            rows[rng.integers(len(rows))][rng.integers(n)] = str(rng.choice(CELLS))
+        if seed % 5 < 2:
+            rows.insert(0, ["x", "y", "z", "nx", "ny", "nz", "weight"][:n])
+        if seed % 7 == 0:
+            rows.insert(0, [str(rng.integers(1, 5))])
+        put(tmp_path, "a.csv", "\n".join(delimiter.join(row) for row in rows) + "\n" * int(rng.integers(3)))
+        monkeypatch.setattr(tables, "_plain_numbers", lambda *_: None)
+        expected = outcome()
+        monkeypatch.setattr(tables, "_plain_numbers", read_plain)
+        assert outcome() == expected, seed
+        n_plain += tables.read_table(tmp_path / "a.csv")._plain is not None if expected[2] is None else 0
+    assert n_plain > 100
 
 
 # Refusals

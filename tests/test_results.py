@@ -15,7 +15,8 @@ import fitting
 import jaxsubdiv as js
 from fitting.__main__ import main
 from fitting.run.folder import RESULTS, filling, working_in
-from fitting.run.names import find_scans, name_folders
+from fitting.run.names import find_scans, name_folder, name_folders
+from jaxsubdiv.__main__ import main as refine
 from jaxsubdiv.console import lasting_streams, printable
 
 pytestmark = pytest.mark.usefixtures("command_settings")
@@ -84,6 +85,42 @@ def test_scans_of_a_folder_are_files_and_no_summary_and_each_counts_once(here):
     Path("scans/summary.csv").write_text("x,y,z\n1,2,3\n")
     Path("scans/b.xyz").mkdir()
     assert find_scans([Path("scans"), Path("scans/a.xyz"), Path("scan.xyz")]) == [Path("scans/a.xyz"), Path("scan.xyz")]
+
+
+@pytest.mark.parametrize(
+    ("scan", "folder"),
+    [
+        ("a.ply", "fit_a.ply"),
+        ("a.xyz", "fit_a.xyz"),
+        ("p/a.ply", "fit_p_a.ply"),
+        ("./p/../q/a.ply", "fit_q_a.ply"),
+        ("../p/a.ply", "fit_home_p_a.ply"),
+        ("/home/u/a.ply", "fit_a.ply"),
+        ("/disk/a.ply", "fit_disk_a.ply"),
+    ],
+)
+def test_scan_fitted_alone_gets_a_folder_by_its_place(monkeypatch, scan, folder):
+    monkeypatch.setattr(os, "getcwd", lambda: "/home/u")
+    assert name_folder(Path(scan)) == folder
+
+
+def test_fit_of_another_file_takes_no_place(here):
+    write_scan("scan.txt", 1)
+    for name in ("scan.xyz", "scan.txt"):
+        assert run(name, *QUICK) == 1
+    for i, name in enumerate(("scan.xyz", "scan.txt")):
+        np.testing.assert_array_equal(fitting.load(f"fit_{name}").scan.points, np.float64(problem().points + noise(i)))
+
+
+def test_results_of_a_fit_are_no_scans(here):
+    write_scan("scans/a.xyz")
+    assert run("scans/a.xyz", *QUICK, "-o", "scans") == 1
+    assert {"surface.ply", "control.obj", "fit.npz"} <= set(names("scans"))
+    assert find_scans([Path("scans")]) == [Path("scans/a.xyz")]
+    Path("scans/fit.npz").rename("scans/checkpoint_start.npz")  # as a run that was stopped leaves them
+    assert find_scans([Path("scans")]) == [Path("scans/a.xyz")]
+    Path("scans/checkpoint_start.npz").unlink()  # then nothing marks them
+    assert find_scans([Path("scans")]) == [Path(f"scans/{name}") for name in ("a.xyz", "control.obj", "surface.ply")]
 
 
 def test_scans_of_one_name_get_their_own_results(here):
@@ -286,6 +323,24 @@ def test_closed_streams_lose_words_and_no_results(here, monkeypatch, stream):
         assert run("scan.xyz", "none.xyz", *QUICK, "-o", "out") == 2
         assert sys.stdout is stream
     assert names("out") == ["scan", "summary.csv"] and names("out/scan") == sorted(RESULTS)
+
+
+@pytest.mark.parametrize("stream", [None, Broken()])
+def test_closed_streams_lose_words_and_no_refined_mesh(here, monkeypatch, stream):
+    with monkeypatch.context() as patch:
+        patch.setattr("sys.stdout", stream)
+        patch.setattr("sys.stderr", stream)
+        assert refine(["control.obj", "out.obj", "--levels", "1"]) == 0
+        assert refine(["none.obj", "out.obj"]) == 2
+    assert js.read_mesh("out.obj").n_faces
+
+
+def test_refinement_says_names_in_letters_that_the_terminal_has(here, monkeypatch):
+    raw = io.BytesIO()
+    Path("control.obj").rename("caf\u00e9.obj")
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(raw, encoding="ascii"))
+    assert refine(["caf\u00e9.obj", "out.obj", "--levels", "1"]) == 0
+    assert b"read     caf\\xe9.obj" in raw.getvalue()
 
 
 def test_letters_that_a_terminal_lacks_are_escaped(monkeypatch):

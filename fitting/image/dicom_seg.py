@@ -23,4 +23,5 @@ def read(path: Path) -> Volume:
         raise ScanError(f"it is no DICOM segmentation in even slices, or damaged: {error!r}.") from None
     labels = tuple(Label(int(number), str(name), layer) for layer, (number, name) in enumerate(named))
     valued = tuple((layer > 0) * np.int32(label.value) for layer, label in zip(layers, labels, strict=True))
-    return Volume(valued, affine, "LPS", labels)
+    # Slices without any segment are not stored: past the last there is nothing, not the end of what was seen.
+    return Volume(valued, affine, "LPS", labels).padded((1, 0, 0), (1, 0, 0))

@@ -74,12 +74,21 @@ def _place(values: np.ndarray, header: Any) -> Volume:
     units = {_UNITS.get(str(unit).strip('"').lower(), 1.0) for unit in header.get("space units", ["mm"])}
     frame, signs = _SPACES.get(str(header.get("space", "")).lower(), (None, (1, 1, 1)))
     affine[:3] *= np.array(signs)[:, None] * (units.pop() if len(units) == 1 else 1.0)
-    return Volume(tuple(layers), affine, frame, tuple(_labels(header, len(layers))))
+    volume = Volume(tuple(layers), affine, frame, tuple(_labels(header, len(layers))))
+    offset = _vector(str(header.get("Segmentation_ReferenceImageExtentOffset", "")).split())
+    if offset is None:
+        return volume
+    # 3D Slicer stores no more than the box of all segments: past it there is nothing, but where the image begins.
+    first, second, third = (int(n > 0) for n in offset)
+    return volume.padded((first, second, third), (1, 1, 1))
 
 
 def _vector(row: Any) -> np.ndarray | None:
     """Three numbers; None for the direction of an axis that is none of space."""
-    values = np.asarray(row, dtype=float).ravel() if row is not None else np.zeros(0)
+    try:
+        values = np.asarray(row, dtype=float).ravel() if row is not None else np.zeros(0)
+    except ValueError:
+        return None
     return values if values.shape == (3,) and np.isfinite(values).all() else None
 
 

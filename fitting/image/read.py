@@ -5,6 +5,7 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +23,15 @@ _READERS: dict[str, Callable[[Path], Volume]] = {
     ".mhd": meta_image.read,
     ".dcm": dicom_seg.read,
 }
+
+
+class Seen(NamedTuple):
+    """A scan, and the image that it was seen in."""
+
+    scan: Scan
+    volume: Volume
+    label: Label | None
+    """None of a grey image."""
 
 
 def stem(path: Path) -> str:
@@ -121,7 +131,7 @@ def read_scan(
         return read_points(path, scale=scale, labels=labels)
     if labels:
         raise ScanError(f"{path.name}: --labels (`labels=`) is for tables; a label map takes --label (`label=`).")
-    return scan_of_volume(read_volume(path, scale=scale), path.name, label=label, above=above)
+    return read_seen(path, scale=scale, label=label, above=above).scan
 
 
 def read_labels(path: str | os.PathLike[str]) -> list[Label]:
@@ -137,21 +147,23 @@ def read_labels(path: str | os.PathLike[str]) -> list[Label]:
         raise ScanError(f"{Path(path).name}: {error}") from None
 
 
-def scan_of_volume(
-    volume: Volume, name: str, *, label: Label | str | int | None = None, above: float | None = None
-) -> Scan:
-    """The scan of a label, or of a grey value's surface; `name` is the file's, for errors and warnings."""
+def read_seen(
+    path: Path, *, scale: float = 1.0, label: Label | str | int | None = None, above: float | None = None
+) -> Seen:
+    """The scan of an image file, see `read_scan`, and what it was made of."""
     if label is not None and above is not None:
-        raise ScanError(f"{name}: give a label of a label map or the grey value of an image, not both.")
+        raise ScanError(f"{path.name}: give a label of a label map or the grey value of an image, not both.")
+    volume = read_volume(path, scale=scale)
     try:
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             if above is not None:
-                scan = scan_above(volume, above)
+                seen = Seen(scan_above(volume, above), volume, None)
             else:
-                scan = scan_of_label(volume, label if isinstance(label, Label) else choose_label(volume, label))
+                one = label if isinstance(label, Label) else choose_label(volume, label)
+                seen = Seen(scan_of_label(volume, one), volume, one)
     except ScanError as error:
-        raise ScanError(f"{name}: {error}") from None
+        raise ScanError(f"{path.name}: {error}") from None
     for one in told:
-        warnings.warn(f"{name}: {one.message}", one.category, stacklevel=3)
-    return scan
+        warnings.warn(f"{path.name}: {one.message}", one.category, stacklevel=3)
+    return seen

@@ -49,13 +49,20 @@ class Volume(NamedTuple):
         """In mm^3."""
         return float(abs(np.linalg.det(self.affine[:3, :3])))
 
-    def positions(self, index: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+    def positions(self, index: Float[np.ndarray, "*p 3"]) -> Float[np.ndarray, "*p 3"]:
         """Where places between voxels lie, in mm."""
         return index @ self.affine[:3, :3].T + self.affine[:3, 3]
 
-    def indices(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+    def indices(self, points: Float[np.ndarray, "*p 3"]) -> Float[np.ndarray, "*p 3"]:
         """Where positions in mm lie among the voxels."""
         return (points - self.affine[:3, 3]) @ np.linalg.inv(self.affine[:3, :3]).T
+
+    def padded(self, before: tuple[int, int, int], after: tuple[int, int, int]) -> "Volume":
+        """The same with so many voxels of background along each index before and after it."""
+        affine = self.affine.copy()
+        affine[:3, 3] = self.positions(-np.array(before, float))
+        widths = tuple(zip(before, after, strict=True))
+        return self._replace(layers=tuple(np.pad(layer, widths) for layer in self.layers), affine=affine)
 
     def scaled(self, scale: float) -> "Volume":
         """The same with positions in another unit."""

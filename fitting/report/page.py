@@ -4,6 +4,7 @@ import base64
 import html
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,9 @@ import jaxsubdiv as js
 from jaxsubdiv.console import printable
 from jaxsubdiv.files import replacing
 
+from ..image.slices import Slice
 from .coverage import distances_to_scan
+from .picture import as_png, draw_slices
 from .report import Report
 from .result import FitResult
 
@@ -30,6 +33,7 @@ def write_page(
     title: str = "",
     start: js.ControlMesh | None = None,
     uncertainty: bool = True,
+    slices: Sequence[Slice] = (),
 ) -> None:
     """Write a fit as one HTML file that needs nothing else: it opens from a disk or a mail, without a network.
 
@@ -43,6 +47,8 @@ def write_page(
         title: above the page; default: "Fit".
         start: the control mesh where the fit started; default: what the result remembers.
         uncertainty: with the standard deviation, which takes a second or more.
+        slices: of the image that the scan was seen in, see `cut_slices`: shown with the surface's contour, where
+            matplotlib of the extra `viz` is installed.
     """
     report = result.report(uncertainty=uncertainty)
     first = result.start if start is None else start
@@ -57,6 +63,7 @@ def write_page(
         "START": "" if first is None else '<label><input type="checkbox" id="start"> where the fit started</label>',
         "HISTOGRAM": _histogram(result),
         "CONVERGENCE": _convergence(result),
+        "SLICES": _slices(result, slices),
         "ROWS": _rows(report),
         "DATA": json.dumps(_data(result, report, first, uncertainty), allow_nan=False).replace("<", "\\u003c"),
         "SCRIPT": (here / "page.js").read_text(encoding="utf-8"),
@@ -114,6 +121,17 @@ def _choices(uncertainty: bool) -> str:
         f'<label><input type="radio" name="colour" value="{value}"{" checked" * (value == "distance")}> {name}</label>'
         for value, name in names.items()
     )
+
+
+def _slices(result: FitResult, slices: Sequence[Slice]) -> str:
+    if not slices:
+        return ""
+    try:
+        picture = base64.b64encode(as_png(draw_slices(result, slices))).decode("ascii")
+    except ImportError:  # the page itself needs nothing
+        return ""
+    name = "the fitted surface's contour over three slices of the image"
+    return f'<h2>Slices</h2>\n<img src="data:image/png;base64,{picture}" alt="{name}" style="width: 100%">'
 
 
 def _rows(report: Report) -> str:

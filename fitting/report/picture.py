@@ -2,6 +2,7 @@
 
 import io
 import warnings
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.spatial import KDTree
 import jaxsubdiv as js
 from jaxsubdiv.console import printable
 
+from ..image.slices import Slice
 from ..scan.closest_points import nearest_rows
 from .result import FitResult
 
@@ -21,13 +23,14 @@ _COLOURS = "RdBu_r"  # red where the scan lies outside of the surface, blue insi
 _NEAREST = 8
 
 
-def draw_fit(result: FitResult, start: js.ControlMesh, *, title: str = "") -> "Figure":
+def draw_fit(result: FitResult, start: js.ControlMesh, *, title: str = "", slices: Sequence[Slice] = ()) -> "Figure":
     """A figure of a fit: control mesh before and after, the surface, its distance from the scan, convergence.
 
     Args:
         result: the fit.
         start: the control mesh where the fit started.
         title: above the picture.
+        slices: of the image that the scan was seen in, see `cut_slices`: drawn with the surface's contour.
 
     Returns:
         A matplotlib figure: `.savefig("fit.png")`, or the last line of a notebook's cell.
@@ -35,27 +38,9 @@ def draw_fit(result: FitResult, start: js.ControlMesh, *, title: str = "") -> "F
     Raises:
         ImportError: matplotlib is missing; it comes with the extra `viz`.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError("pictures need matplotlib: pip install 'jaxsubdiv[viz]'") from error
-
-    class Picture(Figure):
-        """A figure that notebooks show where pyplot, which would tell them how, was never imported."""
-
-        def draw(self, renderer: Any) -> None:
-            with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", "Glyph .* missing from")  # names are in all scripts
-                super().draw(renderer)
-
-        def _repr_png_(self) -> bytes:
-            file = io.BytesIO()
-            self.savefig(file, format="png")
-            return file.getvalue()
-
-    figure = Picture(figsize=(15, 9.5), layout="constrained", dpi=100)
+    figure = _make_figure(15.0, 14.25 if slices else 9.5)
     figure.suptitle(printable(title), fontsize=14, parse_math=False)  # a `$` in a name is no formula
-    (before, after, smooth), (error, counts, convergence) = figure.subplots(2, 3)
+    (before, after, smooth), (error, counts, convergence), *below = figure.subplots(3 if slices else 2, 3)
     view, surface = js.view_of(result.surface), result.surface
     for ax, vertices, name in (
         (before, start.vertices, "control mesh at the start, and the scan"),
@@ -70,7 +55,60 @@ def draw_fit(result: FitResult, start: js.ControlMesh, *, title: str = "") -> "F
     _draw_error(error, result, view)
     _draw_counts(counts, result)
     _draw_convergence(convergence, result)
+    for row in below:
+        for ax, one in zip(row, slices, strict=True):
+            _draw_slice(ax, one, surface)
     return figure
+
+
+def draw_slices(result: FitResult, slices: Sequence[Slice]) -> "Figure":
+    """A figure of the slices alone, with the contour of the fitted surface.
+
+    Raises:
+        ImportError: matplotlib is missing; it comes with the extra `viz`.
+    """
+    figure = _make_figure(15.0, 5.0)
+    for ax, one in zip(figure.subplots(1, len(slices)), slices, strict=True):
+        _draw_slice(ax, one, result.surface)
+    return figure
+
+
+def as_png(figure: "Figure") -> bytes:
+    """A figure as the bytes of a PNG file."""
+    file = io.BytesIO()
+    figure.savefig(file, format="png")
+    return file.getvalue()
+
+
+def _make_figure(width: float, height: float) -> "Figure":
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError("pictures need matplotlib: pip install 'jaxsubdiv[viz]'") from error
+
+    class Picture(Figure):
+        """A figure that notebooks show where pyplot, which would tell them how, was never imported."""
+
+        def draw(self, renderer: Any) -> None:
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "Glyph .* missing from")  # names are in all scripts
+                super().draw(renderer)
+
+        def _repr_png_(self) -> bytes:
+            return as_png(self)
+
+    return Picture(figsize=(width, height), layout="constrained", dpi=100)
+
+
+def _draw_slice(ax: Any, one: Slice, surface: js.RefinedSurface) -> None:
+    from matplotlib.collections import LineCollection
+
+    ax.imshow(one.grey, cmap="gray", vmin=0, vmax=1, aspect=one.height, interpolation="nearest")
+    lines = one.cut(np.asarray(surface.vertices, np.float64), np.asarray(surface.triangles()))
+    ax.add_collection(LineCollection(list(lines), colors="tab:orange", linewidths=1.2))
+    ax.set_axis_off()
+    for letter, x, y in zip(one.sides or (), (0.02, 0.98, 0.5, 0.5), (0.5, 0.5, 0.97, 0.03), strict=False):
+        ax.text(x, y, letter, transform=ax.transAxes, color="tab:cyan", ha="center", va="center", fontweight="bold")
 
 
 def surface_distances(result: FitResult) -> Float[np.ndarray, "v"]:

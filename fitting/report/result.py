@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import math
 import os
-import warnings
 from typing import final
 
 import numpy as np
@@ -12,6 +11,7 @@ import optimistix as optx
 from jaxtyping import Bool, Float
 
 import jaxsubdiv as js
+from jaxsubdiv.notices import warn
 
 from ..finding import Finding
 from ..model.pairing import make_scene
@@ -121,10 +121,9 @@ class FitResult:
             UserWarning: the fit did not converge: the derivative is that of where it stopped.
         """
         if self.result != optx.RESULTS.successful:
-            warnings.warn(
+            warn(
                 "the fit did not converge: what depends on the scan here is the surface where it stopped, not the best "
                 "one. Give more `max_sweeps`.",
-                stacklevel=2,
             )
         return make_refit(self.posterior)
 

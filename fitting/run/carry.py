@@ -1,6 +1,5 @@
 """A template's landmarks on the surface that was fitted: the same places, where the anatomy of the scan has them."""
 
-import warnings
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -9,6 +8,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 import jaxsubdiv as js
+from jaxsubdiv.notices import warn
 
 from ..report.result import FitResult
 from ..scan.closest_points import closest_points
@@ -118,9 +118,8 @@ def _warn_of_far(names: tuple[str, ...], off: Float[np.ndarray, "l 3"], edge: fl
     far = np.flatnonzero(distances > edge)
     if len(far):
         worst = far[np.argmax(distances[far])]
-        warnings.warn(
+        warn(
             f"{len(far)} of {len(names)} landmarks lie farther from the template's surface than a control edge, "
             f"{edge:.3g} mm: {', '.join(names[i] for i in far)}; '{names[worst]}' by {distances[worst]:.3g} mm. Are "
-            "they in the template's frame and unit?",
-            stacklevel=3,
+            "they in the template's frame and unit?"
         )

@@ -5,7 +5,6 @@ of one program for all: the strengths of the priors are given, or found once by 
 equations are solved by conjugate gradients, without a matrix, not further than a sweep deserves.
 """
 
-import warnings
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
@@ -19,6 +18,7 @@ from jaxtyping import Array
 
 import jaxsubdiv as js
 from jaxsubdiv.errors import name_rows
+from jaxsubdiv.notices import warn
 
 from ..model.limits import check_numbers
 from ..model.pairing import Scene, make_scene
@@ -109,7 +109,7 @@ def fit_cohort(
     sound = {}
     for control in controls:  # mostly the same one for all
         if id(control) not in sound:
-            sound[id(control)] = sound_start(scheme, topology, control, free, stacklevel=3)
+            sound[id(control)] = sound_start(scheme, topology, control, free)
     controls = [sound[id(control)] for control in controls]
     places = [None] * n if landmarks is None else _one_each(landmarks, Landmarks, n, "landmarks")
     curves = [None] * n if boundary is None else _one_each(boundary, BoundaryCurve, n, "boundaries")
@@ -159,10 +159,9 @@ def fit_cohort(
     converged = status == CONVERGED
     if not converged.all():
         which = np.flatnonzero(~converged)
-        warnings.warn(
+        warn(
             f"{len(which)} of {n} fits did not converge, of the scans {name_rows(which)}: see `Cohort.converged`. "
             "Align them better, or give more `max_sweeps`.",
-            stacklevel=2,
         )
     told = Settings.of(scheme, topology, **settings)
 

@@ -1,7 +1,6 @@
 """`fit`: steps the solver `Sweeps` until the surface has come to rest, with progress and checkpoints."""
 
 import os
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -15,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 import jaxsubdiv as js
 from jaxsubdiv.linalg import unit
+from jaxsubdiv.notices import warn
 
 from ..model.limits import check_numbers
 from ..model.pairing import Scene, make_scene
@@ -49,7 +49,6 @@ _FAR = 0.05
 _UNIT_RATIO = 20.0
 _LEAST_MARGIN = 0.05  # of a control normal at the start; see `js.admissible_margin`
 CHECKPOINT = "checkpoint.npz"
-_CALLS_AWAY = 4  # from what warns to the line that calls `fitting.fit`
 
 
 class Sweep(NamedTuple):
@@ -141,7 +140,7 @@ def fit(
     if alike is not None and alike.shape != (topology.n_control_faces,):
         n_faces = topology.n_control_faces
         raise ValueError(f"`alike` must say it of each of the {n_faces} control faces; got {list(alike.shape)}.")
-    control = sound_start(scheme, topology, control, free, _CALLS_AWAY)
+    control = sound_start(scheme, topology, control, free)
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
     settings["landmark_deviation"] = landmark_deviation
     given = {"scheme": scheme, "topology": topology, "control": control, "scan": scan, "landmarks": landmarks}
@@ -278,13 +277,10 @@ def find_partners(
     return symmetry_of(symmetry.partner, np.asarray(control.vertices))
 
 
-def sound_start(
-    scheme: js.AbstractScheme, topology: js.Topology, control: js.Control, free: Free, stacklevel: int = 2
-) -> js.Control:
-    """The control mesh without faces upside down, with unit normals that fold nothing; for the warnings, how many calls
-    away the user's line is."""
+def sound_start(scheme: js.AbstractScheme, topology: js.Topology, control: js.Control, free: Free) -> js.Control:
+    """The control mesh without faces upside down, with unit normals that fold nothing."""
     may_move = free.masks(scheme, topology.n_control_vertices)["vertices"]
-    control = unfolded_start(topology, control, may_move, stacklevel + 1)
+    control = unfolded_start(topology, control, may_move)
     return js.Control(control.vertices, given_normals(topology, control))
 
 
@@ -300,11 +296,10 @@ def given_normals(topology: js.Topology, control: js.Control) -> Float[Array, "v
 def _warn_if_far(off: float, control: js.Control) -> None:
     size = float(np.linalg.norm(np.ptp(np.asarray(control.vertices), axis=0)))
     if off > _FAR * size:
-        warnings.warn(
+        warn(
             f"half of the scan lies over {off:.3g} mm from the surface at the start, which is {size:.3g} mm across: "
             "points will be paired with the wrong places. Align the control mesh with the scan first; axes named in "
             "another order or a mirrored side are common causes.",
-            stacklevel=_CALLS_AWAY,
         )
 
 

@@ -8,15 +8,16 @@ from itertools import count
 from pathlib import Path
 
 from ..image.read import is_image, stem
+from .folder import CARRIED, SUMMARY, results_in
 
-SUMMARY, ALL_LANDMARKS = "summary.csv", "landmarks.csv"
-"""Tables of all scans."""
 _SCAN_FILES = {".ply", ".xyz", ".csv", ".txt", ".npz", ".vtp", ".vtk", ".stl", ".obj", ".off", ".gii"}
 _LONGEST = 200  # bytes: file systems take 255, and a file that is being written has a longer name
 
 
 def find_scans(given: Sequence[Path]) -> list[Path]:
     """The files named, and those in the folders named in order of their names, each once.
+
+    What an earlier fit left in such a folder is none of them.
 
     Raises:
         ValueError: a folder holds no scan.
@@ -26,7 +27,8 @@ def find_scans(given: Sequence[Path]) -> list[Path]:
         if not path.is_dir():
             scans.append(path)
             continue
-        inside = sorted(file for file in path.iterdir() if _is_scan(file))
+        results = results_in(path)
+        inside = sorted(file for file in path.iterdir() if _is_scan(file) and file.name.lower() not in results)
         if not inside:
             raise ValueError(f"the folder {path} holds no scan: {', '.join(sorted(_SCAN_FILES))}.")
         scans += inside
@@ -34,9 +36,7 @@ def find_scans(given: Sequence[Path]) -> list[Path]:
 
 
 def _is_scan(file: Path) -> bool:
-    # The tables lie here where the results of an earlier run went into the folder of its scans.
-    known = file.suffix.lower() in _SCAN_FILES or is_image(file)
-    return known and file.name.lower() not in (SUMMARY, ALL_LANDMARKS) and not file.is_dir()
+    return (file.suffix.lower() in _SCAN_FILES or is_image(file)) and not file.is_dir()
 
 
 def name_folders(scans: Sequence[Path]) -> list[str]:
@@ -61,6 +61,13 @@ def name_folders(scans: Sequence[Path]) -> list[str]:
             steps[i] += 1
 
 
+def name_folder(scan: Path) -> str:
+    """The folder's name for a file that is fitted alone: its place below here, so that no other file there has it."""
+    path, here = Path(os.path.abspath(scan)), Path.cwd()
+    parts = path.relative_to(here).parts if path.is_relative_to(here) else path.parts[1:]
+    return _number(["_".join(("fit", *parts))])[0]
+
+
 def _choices(scan: Path) -> list[str]:
     """Names for one scan, from the shortest on."""
     parts = Path(os.path.abspath(scan)).parts[1:]
@@ -74,7 +81,7 @@ def _key(name: str) -> str:
 
 def _bad(name: str) -> bool:
     """Whether a folder cannot have the name, as `..`, or not beside the tables of all."""
-    return _key(name) in ("", SUMMARY, ALL_LANDMARKS) or len(os.fsencode(name)) > _LONGEST
+    return _key(name) in ("", SUMMARY, CARRIED) or len(os.fsencode(name)) > _LONGEST
 
 
 def _number(names: list[str]) -> list[str]:

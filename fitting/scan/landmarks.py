@@ -2,7 +2,6 @@
 
 import json
 import reprlib
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -15,6 +14,7 @@ import jaxsubdiv as js
 from jaxsubdiv.files import replacing
 from jaxsubdiv.frames import AXES, Frame, in_frame
 from jaxsubdiv.markups import read_control_points, write_control_points
+from jaxsubdiv.notices import warn
 from jaxsubdiv.tables import decode
 
 from .scan import ScanError
@@ -106,10 +106,8 @@ def read_framed_landmarks(path: str | Path, *, scale: float = 1.0, frame: Frame 
     if not landmarks:
         raise ScanError(f"{path} holds no landmarks.")
     if own is not None and frame is None:
-        warnings.warn(
-            f"{path.name}: positions are in {own} ({AXES[own]}), as the file says; scan and template must be in it "
-            "too.",
-            stacklevel=3,
+        warn(
+            f"{path.name}: positions are in {own} ({AXES[own]}), as the file says; scan and template must be in it too."
         )
     if own is not None and frame is not None:
         landmarks = {name: in_frame(position, own, frame) for name, position in landmarks.items()}
@@ -241,8 +239,6 @@ def _json_rows(path: Path) -> tuple[list[_Row], Frame | None]:
 def _control_points(path: Path) -> tuple[list[_Row], Frame | None]:
     points = read_control_points(path)
     if points.unit != "mm":
-        warnings.warn(
-            f"{path.name}: positions are in {points.unit}, as the file says; `scale` turns them into mm.", stacklevel=4
-        )
+        warn(f"{path.name}: positions are in {points.unit}, as the file says; `scale` turns them into mm.")
     numbered = enumerate(zip(points.labels, points.places, points.positions.tolist(), strict=True), 1)
     return [(label or f"{i}", place, position) for i, (label, place, position) in numbered], points.frame

@@ -1,6 +1,5 @@
 """Alignment: the template moved to where the scan is, by one linear map and a shift. numpy and scipy, no JAX."""
 
-import warnings
 from itertools import permutations, product
 from typing import Literal, NamedTuple, TypeAlias, get_args
 
@@ -11,6 +10,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 import jaxsubdiv as js
+from jaxsubdiv.notices import warn
 
 from ..finding import Finding, Pose
 from ..scan.closest_points import nearest_rows
@@ -575,7 +575,7 @@ def _finish(
     else:
         doubts += _scale_doubt(found.scaled) + _other_answers(chosen, others, found.share_of_template)
     for doubt in doubts:
-        warnings.warn(f"alignment: {doubt.text}", stacklevel=3)
+        warn(f"alignment: {doubt.text}")
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = pose.linear, pose.shift
     return Alignment(transform, put(mesh, transform), rms, share, tuple(doubts), found)

@@ -1,6 +1,5 @@
 """A control mesh made from a scan, where none is given."""
 
-import warnings
 from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
@@ -9,6 +8,7 @@ from scipy.spatial import KDTree
 
 import jaxsubdiv as js
 from jaxsubdiv.half_edges import half_edges
+from jaxsubdiv.notices import warn
 
 from ..finding import Finding
 from ..scan.closest_points import nearest_rows
@@ -90,7 +90,7 @@ def make_control_mesh(scan: Scan, *, faces: int, kind: FaceKind, closed: bool | 
     chosen, others, findings = choose(find_parts(cloud, closed), part)
     findings = (*_unit_doubt(float(np.linalg.norm(np.ptp(cloud.points, axis=0)))), *findings)
     for finding in findings:
-        warnings.warn(finding.text, stacklevel=3)
+        warn(finding.text)
     area = sum(one.dense.areas.sum() for one in chosen)
     meshes = [_mesh_of(one, max(_LEAST_FACES, round(faces * one.dense.areas.sum() / area)), kind) for one in chosen]
     points = np.asarray(scan.points, np.float64)

@@ -4,7 +4,6 @@ Remeshing leaves such faces, where a vertex with three neighbours has come to li
 that lies in three layers takes its points from all of them in turn, and what no point holds rises to a fin.
 """
 
-import warnings
 from typing import Any
 
 import equinox as eqx
@@ -15,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 import jaxsubdiv as js
 from jaxsubdiv.errors import name_rows
 from jaxsubdiv.half_edges import HalfEdges, half_edges
+from jaxsubdiv.notices import warn
 
 from ..scan.closest_points import AnyArray
 from .remesh import averages
@@ -125,11 +125,8 @@ class Folds(eqx.Module):
         return best if np.sum(self.upside_down(best)) < np.sum(turned) else vertices
 
 
-def unfolded_start(
-    topology: js.Topology, control: js.Control, may_move: Bool[np.ndarray, "v"] | bool, stacklevel: int = 2
-) -> js.Control:
-    """The control mesh without faces upside down, as far as vertices that are free can mend it; it warns of them, at
-    the line that is so many calls away."""
+def unfolded_start(topology: js.Topology, control: js.Control, may_move: Bool[np.ndarray, "v"] | bool) -> js.Control:
+    """The control mesh without faces upside down, as far as vertices that are free can mend it; it warns of them."""
     folds, given = Folds(topology), np.asarray(control.vertices, np.float64)
     turned = folds.upside_down(given)
     if not turned.any():
@@ -142,10 +139,9 @@ def unfolded_start(
     else:
         but = f", but {n_stay} of them stay" if n_stay else ""
         done = f"The fit starts with their vertices moved between their neighbours{but}."
-    warnings.warn(
+    warn(
         "faces of the control mesh that lie upside down on those beside them where the fit starts: "
         f"{name_rows(np.flatnonzero(turned))} ({np.sum(turned)} of {len(turned)}, triangles counted before quads). "
         f"{done} Mend them in the control mesh, or make it again.",
-        stacklevel=stacklevel,
     )
     return control if unmended else js.Control(jnp.asarray(mended, control.vertices.dtype), control.normals)

@@ -1,11 +1,12 @@
 """The parts of a scan: surfaces that do not hang together, and the points of each."""
 
-import warnings
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
+
+from jaxsubdiv.notices import warn
 
 from ..finding import Finding
 from ..scan.scan import ScanError
@@ -131,5 +132,5 @@ def _turned_outwards(cloud: Cloud) -> Cloud:
     turned = cloud._replace(normals=-cloud.normals)
     if not is_closed(turned):
         return cloud
-    warnings.warn("the normals of the scan point inwards; they were turned.", stacklevel=5)
+    warn("the normals of the scan point inwards; they were turned.")
     return turned

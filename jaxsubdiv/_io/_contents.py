@@ -1,7 +1,6 @@
 """What passes between the front doors and the formats: plain arrays, not yet checked as a mesh."""
 
 import importlib
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -10,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
+from .. import notices
 from ..errors import MeshError, name_rows
 from ..frames import Frame
 
@@ -45,7 +45,7 @@ def library(module: str, what: str) -> Any:
 
 def warn(path: Path, text: str) -> None:
     """Warn about what a file does to the mesh; the text starts with the file's name."""
-    warnings.warn(f"{path.name}: {text}", stacklevel=2)
+    notices.warn(f"{path.name}: {text}")
 
 
 def doubles(values: Shaped[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
