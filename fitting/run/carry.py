@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 import jaxsubdiv as js
 from jaxsubdiv.notices import warn
 
+from ..report.coverage import unit
 from ..report.result import FitResult
 from ..scan.closest_points import closest_points
 from ..scan.landmarks import Landmarks
@@ -30,7 +31,7 @@ class CarriedLandmarks(NamedTuple):
     surface is, and not which of its places is which. How far the template's landmarks are off themselves is not in it,
     nor how an offset turns with the surface."""
     offsets: Float[np.ndarray, "l"]
-    """How far in mm each lies outside the fitted surface, along its normal."""
+    """How far in mm each lies from the fitted surface, positive outside."""
     at: js.SurfacePoint
     """Where on the fitted surface."""
 
@@ -52,8 +53,9 @@ def carry_landmarks(
     """Put a template's landmarks onto the surface that it was fitted to.
 
     Each landmark is at the point of the template's refined surface that is closest to it: a face, and where in it. The
-    fit moves that point; there the landmark is again. Where it does not lie on the template's surface, its distance
-    along the normal is kept, scaled as the alignment scaled the template.
+    fit moves that point; there the landmark is again. Where it does not lie on the template's surface, it keeps its
+    offset in the frame that the surface has there, of its normal and a side of the face, in proportion to the size of
+    the surface.
 
     Args:
         template: as it was given to `fit_scan`, before any alignment.
@@ -90,17 +92,36 @@ def carry_landmarks(
         )
     before = js.refine(scheme, topology, control)
     at = closest_points(before, places)
-    on_template = js.evaluate(before, at)
-    off = places - np.asarray(on_template.points)
+    on_template, there = _stand(before, at), _stand(result.surface, at)
+    off = places - on_template.points
     _warn_of_far(names, off, float(js.edge_length(topology, control.vertices)))
-    pose = result.fit.origin.pose
-    offsets = np.einsum("lx,lx->l", off, np.asarray(on_template.normals)) * (1.0 if pose is None else pose.scaled)
-    points, normals = (np.asarray(rows, np.float64) for rows in js.evaluate(result.surface, at))
+    grown = float(np.sqrt(result.surface.areas().sum() / before.areas().sum()))
+    within = grown * np.einsum("lix,lx->li", on_template.axes, off)
+    points = there.points + np.einsum("li,lix->lx", within, there.axes)
+    offsets = np.linalg.norm(within, axis=1) * np.where(within[:, 2] < 0, -1.0, 1.0)
     corners, weights = (np.asarray(rows) for rows in js.corner_weights(result.surface, at))
     misfit = np.sum(weights * result.uncertainty().misfit[corners] ** 2, axis=1)
+    normals = there.axes[:, 2]
     across = normals[:, :, None] * normals[:, None, :]
     covariances = result.posterior.covariances(at) + misfit[:, None, None] * across
-    return CarriedLandmarks(names, points + offsets[:, None] * normals, covariances, offsets, at)
+    return CarriedLandmarks(names, points, covariances, offsets, at)
+
+
+class _Stand(NamedTuple):
+    """Where one stands on a surface."""
+
+    points: Float[np.ndarray, "l 3"]
+    axes: Float[np.ndarray, "l 3 3"]
+    """Rows: along the first side of the face, to the left of it, and out of the surface."""
+
+
+def _stand(surface: js.RefinedSurface, at: js.SurfacePoint) -> _Stand:
+    points, normals = (np.asarray(rows, np.float64) for rows in js.evaluate(surface, at))
+    corners, _ = js.corner_weights(surface, at)
+    ends = np.asarray(surface.vertices, np.float64)[np.asarray(corners)[:, :2]]
+    side = ends[:, 1] - ends[:, 0]
+    along = unit(side - np.sum(side * normals, axis=1, keepdims=True) * normals)
+    return _Stand(points, np.stack([along, np.cross(normals, along), normals], axis=1))
 
 
 def _positions(landmarks: Mapping[str, ArrayLike]) -> Float[np.ndarray, "l 3"]:
