@@ -77,9 +77,10 @@ class _Source(NamedTuple):
     label: Label | str | None = None
     """Of a label map."""
 
-    @property
-    def title(self) -> str:
-        return self.path.name if not isinstance(self.label, Label) else f"{self.path.name}, {self.label}"
+    def title(self, whole: bool = False) -> str:
+        """The file's name, or all of its path, and the label where it is one of all."""
+        name = str(self.path) if whole else self.path.name
+        return f"{name}, {self.label}" if isinstance(self.label, Label) else name
 
     @property
     def as_file(self) -> Path:
@@ -130,7 +131,7 @@ def _main(arguments: Sequence[str] | None) -> int:
             return _run_all(scans, options, recipe)
         scan = scans[0] if scans else None
         folder = Path(options.output or (name_folder(scan.as_file) if scan else f"fit_{options.example}"))
-        return _run(scan, folder, options, recipe, scan.title if scan else options.example)["status"]
+        return _run(scan, folder, options, recipe, scan.title() if scan else options.example)["status"]
     except KeyboardInterrupt:
         skips = "; with --resume it skips the scans that are done" if len(scans) > 1 else ""
         print(f"\nstopped  the same command goes on from the last sweep{skips}", file=sys.stderr)
@@ -190,20 +191,21 @@ def _recipe(options: argparse.Namespace) -> Recipe:
 def _run_all(scans: list[_Source], options: argparse.Namespace, recipe: Recipe) -> int:
     """Every scan into a folder of its own, going on after a failure, and a table of all."""
     parent = Path(options.output or "fits")
-    counts = Counter(scan.title for scan in scans)
-    titles = [scan.title if counts[scan.title] == 1 else f"{scan.path}, {scan.title}" for scan in scans]
+    counts = Counter(scan.title() for scan in scans)
+    titles = [scan.title(whole=counts[scan.title()] > 1) for scan in scans]
     folders = name_folders([scan.as_file for scan in scans])
     rows, summary, landmarks = [], "", []
     try:
         with working_in(parent):
             for number, (scan, title, name) in enumerate(zip(scans, titles, folders, strict=True), 1):
-                print(f"\n[{number}/{len(scans)}] {scan.path}{'' if scan.label is None else f', {scan.label}'}")
+                print(f"\n[{number}/{len(scans)}] {scan.title(whole=True)}")
                 rows.append(_run(scan, parent / name, options, recipe, title))
                 summary = _as_csv(rows, _SUMMARY)
                 _write_table(parent / SUMMARY, summary)  # after every scan: the run may be stopped
-                landmarks += _landmark_rows(parent / name / CARRIED, title) if options.carry else []
-                if landmarks:
-                    _write_table(parent / CARRIED, _as_csv(landmarks, tuple(landmarks[0])))
+                if options.carry and rows[-1]["status"] < 2:
+                    landmarks += _landmark_rows(parent / name / CARRIED, title)
+                    columns = dict.fromkeys(column for row in landmarks for column in row)
+                    _write_table(parent / CARRIED, _as_csv(landmarks, tuple(columns)))
     except (ValueError, OSError) as error:
         return _fail(error)
     print(f"\n{summary}\nwrote    {parent / SUMMARY}{f' and {CARRIED}' if landmarks else ''}")
@@ -228,9 +230,7 @@ def _as_csv(rows: list[dict], columns: Sequence[str]) -> str:
 
 
 def _landmark_rows(path: Path, title: str) -> list[dict]:
-    """The landmarks of one scan, as its folder has them; none where its fit failed."""
-    if not path.is_file():
-        return []
+    """The landmarks of one scan, as its folder has them."""
     with path.open(encoding="utf-8", newline="") as file:
         return [{"scan": title} | row for row in csv.DictReader(file)]
 
@@ -395,7 +395,7 @@ def _inputs(scan: _Source | None, options: argparse.Namespace, recipe: Recipe) -
         boundary = BoundaryCurve(boundary_of(js.read_mesh(file, scale=options.scale, check=False)))
     elif options.boundary is not None:
         boundary = BoundaryCurve(js.read_points(options.boundary, scale=options.scale).points)
-    return _Job(scan.title, points, mesh, landmarks, boundary, seen, carried)
+    return _Job(scan.title(), points, mesh, landmarks, boundary, seen, carried)
 
 
 def _template(

@@ -375,6 +375,17 @@ def test_every_scan_gets_landmarks_and_all_of_them_a_table(files, capsys):
     assert "holds a fit with another carried landmarks" in capsys.readouterr().err
 
 
+def test_table_of_all_has_the_scans_that_ended_and_the_frames_of_those_that_say_theirs(files):
+    points = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in (problem().points + noise(1)).tolist())
+    Path("scan1.obj").write_text(f"# SPACE=RAS\n{points}")
+    Path("bad.xyz").write_text("1 2\n")
+    Path("out/bad").mkdir(parents=True)
+    write_landmarks("out/bad/landmarks.csv", PLACES)  # of an earlier fit
+    assert main(["scan0.xyz", "scan1.obj", "bad.xyz", *GIVEN, "--carry", "marks.csv", "-o", "out"]) == 2
+    table = rows("out/landmarks.csv")
+    assert [(row["scan"], row["frame"]) for row in table] == [("scan0.xyz", "")] * 3 + [("scan1.obj", "RAS")] * 3
+
+
 def test_landmarks_of_an_earlier_fit_go_where_the_next_has_none(files):
     assert main(["scan0.xyz", *GIVEN, "--carry", "marks.csv", "-o", "out"]) in (0, 1)
     assert Path("out/landmarks.csv").exists()
