@@ -20,9 +20,9 @@ FIT = "fit.npz"
 """What `fitting.load` reads; it is put in place after all other files."""
 LANDMARKS, CARRIED = "landmarks.mrk.json", "landmarks.csv"
 """Landmarks that were carried to the fit, for 3D Slicer and as a table; beside the summary, a table of those of all."""
-RESULTS = ("control.obj", "surface.ply", "report.json", "fit.html", "recipe.json", "fit.png", LANDMARKS, CARRIED, FIT)
+RESULTS = ("control.obj", "surface.ply", "report.json", "fit.html", "recipe.json", "fit.png", FIT)
 _UNFINISHED = ".unfinished-"  # the folders of `jaxsubdiv.files.replacing` and of `fill`
-_OURS = {*RESULTS, CHECKPOINT, CHECKPOINT_START, SUMMARY}
+_OURS = {*RESULTS, LANDMARKS, CARRIED, CHECKPOINT, CHECKPOINT_START, SUMMARY}
 
 
 def results_in(folder: Path) -> set[str]:
@@ -101,7 +101,7 @@ def filling(folder: Path) -> Iterator[Path]:
     new = Path(tempfile.mkdtemp(prefix=_UNFINISHED, dir=folder))
     try:
         yield new
-        for name in RESULTS:
+        for name in (LANDMARKS, CARRIED, *RESULTS):
             if (new / name).exists():
                 os.replace(new / name, folder / name)
             else:
