@@ -31,7 +31,7 @@ from .image.volume import Label
 from .model.limits import check_numbers
 from .model.priors.boundary import BoundaryCurve, boundary_of
 from .report.page import write_page
-from .report.picture import draw_fit, surface_distances
+from .report.picture import draw_fit
 from .report.result import FitResult
 from .report.saved import read_marks, save_fit
 from .run.carry import carry_landmarks
@@ -41,6 +41,7 @@ from .run.fit_scan import ScanFit, misfit
 from .run.folder import CARRIED, FIT, LANDMARKS, SUMMARY, filling, is_unfinished, working_in
 from .run.names import find_scans, name_folder, name_folders
 from .run.recipe import Recipe, load, load_recipe
+from .run.surface_files import FORMATS, check_formats, write_surface
 from .scan.example import Example, example
 from .scan.landmarks import (
     FramedLandmarks,
@@ -124,7 +125,8 @@ def _main(arguments: Sequence[str] | None) -> int:
     try:
         _check_options(options)
         scans, recipe = _sources(options), _recipe(options)
-    except (ValueError, OSError) as error:
+        check_formats(options.surface)
+    except (ValueError, OSError, ImportError) as error:
         return _fail(error)
     try:
         if len(scans) > 1:
@@ -154,7 +156,7 @@ def _sources(options: argparse.Namespace) -> list[_Source]:
 def _check_options(options: argparse.Namespace) -> None:
     """See that numbers lie in their ranges, and name them as they were typed."""
     names = {"tolerance_mm": "tolerance", "most_points": "points"}
-    names |= {name: name for name in ("levels", "max_sweeps", "faces", "symmetry", "likeness", "h")}
+    names |= {name: name for name in ("levels", "max_sweeps", "faces", "symmetry", "likeness", "h", "surface_level")}
     names |= {name: name for name in ("scale", "control_scale")}
     typed = {name: f"--{option.replace('_', '-')}" for name, option in names.items()}
     check_numbers({name: getattr(options, option) for name, option in names.items()}, typed)
@@ -265,7 +267,7 @@ def _fit(scan: _Source | None, folder: Path, options: argparse.Namespace, recipe
     print(f"scan     {job.scan.n_points:,} points{slices}, {_size(np.asarray(job.scan.points))}")
     if job.seen is not None:
         recipe = _with_suggested(recipe, job.scan, options)
-    marks = _marks(job, recipe)
+    marks = _marks(job, recipe, options)
     done = _done(folder, marks) if options.resume else None
     if done is not None:
         print(f"done     before, in {folder}")
@@ -288,7 +290,7 @@ def _fit(scan: _Source | None, folder: Path, options: argparse.Namespace, recipe
     seconds = time.perf_counter() - began
     report, off = found.result.report(uncertainty=True), misfit(found.result)
     print(f"done     in {seconds:.1f} s{_ending(found, off)}\n\n{dataclasses.replace(report, warnings=[])}\n")
-    _save(folder, found, title, marks, job)
+    _save(folder, found, title, marks, job, options)
     _print_warnings(found.result)
     return _row(title, found.result, off, seconds)
 
@@ -321,12 +323,14 @@ def _row(name: str, result: FitResult, off: float, seconds: float | None) -> dic
     }
 
 
-def _marks(job: _Job, recipe: Recipe) -> dict[str, str]:
+def _marks(job: _Job, recipe: Recipe, options: argparse.Namespace) -> dict[str, str]:
     """What tells this fit from any other, by the names of what went in."""
     inputs = {f"{name} of the scan": value for name, value in vars(job.scan).items()}
     inputs["control mesh"] = None if job.mesh is None else (job.mesh.vertices, job.mesh.faces, job.mesh.normals)
     inputs |= {"landmarks": job.landmarks, "boundary": job.boundary}
     inputs |= {} if job.carried is None else {"carried landmarks": job.carried}
+    if (options.surface, options.surface_level) != (["ply"], None):
+        inputs["surface format or level"] = options.surface, options.surface_level
     return marks_of(inputs | {field.name: getattr(recipe, field.name) for field in dataclasses.fields(recipe)})
 
 
@@ -420,15 +424,16 @@ def _ending(found: ScanFit, off: float) -> str:
     return f"; split {found.splits} times, {found.outcome}: the surface is {off:.3f} mm off the scan beside the noise"
 
 
-def _save(folder: Path, found: ScanFit, title: str, marks: dict[str, str], job: _Job) -> None:
+def _save(
+    folder: Path, found: ScanFit, title: str, marks: dict[str, str], job: _Job, options: argparse.Namespace
+) -> None:
     """The fit as files, all of them in place of those of an earlier one, or none."""
     result, frame = found.result, job.scan.frame or (job.carried.frame if job.carried is not None else None)
     slices = _slices_of(job, result)
-    written = ["control.obj", "surface.ply", "report.json", "fit.html", "fit.npz", "recipe.json"]
     with filling(folder) as new:
         js.write_mesh(new / "control.obj", result.control_mesh, frame=frame)
-        values = {"distance_mm": surface_distances(result), "deviation_mm": result.uncertainty().surface}
-        js.write_mesh(new / "surface.ply", result.surface, vertex_data=values, frame=frame)
+        written = ["control.obj", *_write_surface(new, result, options, frame)]
+        written += ["report.json", "fit.html", "fit.npz", "recipe.json"]
         if job.carried is not None and job.mesh is not None:
             there = carry_landmarks(job.mesh, result, job.carried.positions)
             for name in (LANDMARKS, CARRIED):
@@ -444,6 +449,15 @@ def _save(folder: Path, found: ScanFit, title: str, marks: dict[str, str], job: 
         except ImportError as error:
             print(f"note     no picture: {error}")
     print(f"wrote    {', '.join(written)} in {folder}")
+
+
+def _write_surface(folder: Path, result: FitResult, options: argparse.Namespace, frame: Frame | None) -> list[str]:
+    """The surface's files; where it has no such level, told, none: the fit itself is not lost."""
+    try:
+        return write_surface(folder, result.at_level(options.surface_level), options.surface, frame)
+    except (ValueError, MemoryError) as error:
+        print(f"note     no surface: {str(error) or 'it takes more memory than there is'}")
+        return []
 
 
 class _Progress:
@@ -520,11 +534,12 @@ def _parser() -> argparse.ArgumentParser:
         "the anatomy. The control mesh is aligned with the scan first, or made from it where none is given. Without "
         "SCAN it runs an example that ships with the package.",
         epilog="OUT gets control.obj (fitted control mesh with normals), surface.ply (refined surface, with the signed "
-        "distance of the scan and the standard deviation of the surface in mm at every vertex), report.json, "
-        "fit.html (a page to turn the surface in, without a network), fit.png, and fit.npz and recipe.json for "
-        "`fitting.load`; with --carry landmarks.mrk.json and landmarks.csv; of several scans, a folder each, named "
-        "by the scan, and where names are alike by its folders too, and summary.csv, and landmarks.csv with all "
-        "landmarks. Files take their places together when a fit has ended; until then checkpoints mark OUT as "
+        "distance of the scan and the standard deviation of the surface in mm at every vertex, as in .glb, .vtp and "
+        ".shape.gii), report.json, fit.html (a page to turn the surface in, without a network), fit.png, and fit.npz "
+        "and recipe.json for `fitting.load`; with --carry landmarks.mrk.json and landmarks.csv; of several scans, a "
+        "folder each, named by the scan, and where names are alike by its folders too, and summary.csv, and "
+        "landmarks.csv with all landmarks. Files take their places together when a fit has ended; until then "
+        "checkpoints mark OUT as "
         "unfinished. Lengths are in mm. A fit that was stopped, by Ctrl-C or otherwise, goes on from the last sweep "
         "when the same command is given again. Exit status: 0 the fit converged and nothing speaks against it, 1 it "
         "is not to be trusted (the warnings say why; files are written all the same), 2 an input cannot be used, 130 "
@@ -565,6 +580,20 @@ def _parser() -> argparse.ArgumentParser:
     add("--scale", type=float, default=1.0, help="multiplies the scan's coordinates; 1000 for metres")
     add("--control-scale", type=float, default=1.0, help="multiplies the control mesh's coordinates")
     add("--levels", type=int, help=f"levels of refinement, 1 to 8 (default: {Recipe.levels})")
+    add(
+        "--surface",
+        nargs="+",
+        metavar="FORMAT",
+        choices=FORMATS,
+        default=["ply"],
+        help=f"of the surface's files: {', '.join(FORMATS)} (default: ply)",
+    )
+    add(
+        "--surface-level",
+        type=int,
+        metavar="N",
+        help="levels of the surface that is written, 0 to 8 (default: those of the fit)",
+    )
     add("--scheme", choices=tuple(SCHEMES), help="default: interpolating")
     add("--h", type=float, help="tangent length coefficient at the start, for schemes that have one (default: 1)")
     add("--max-sweeps", type=int, help=f"pairing and solving in turns (default: {Recipe.max_sweeps})")

@@ -7,10 +7,12 @@ from pathlib import Path
 import jax
 import jaxtyping
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 # XLA's newer emitters take three times as long to compile, and every program here is compiled to run a few times. Given
 # before the first program is compiled, and in the environment, so that commands in processes of their own have it too.
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
+if jax.__version_info__ < (0, 11):  # later ones may have no others, and end Python where they do not know a flag
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_disable_most_optimizations", True)  # programs that run a few times take longer to be made fast
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -20,6 +22,26 @@ jaxtyping.install_import_hook(["jaxsubdiv", "fitting"], "beartype.beartype")  # 
 _ROOT = Path(__file__).parents[1]
 _MAPS, _MOST_MAPS = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 _tests = itertools.count()
+_LONGEST = (
+    "test_notebooks",
+    "test_posterior",
+    "test_gradients",
+    "test_likeness",
+    "test_engine",
+    "test_fit",
+    "test_commands",
+)
+
+
+def pytest_configure(config):
+    """Let xdist begin with what was collected first; of itself it leaves files of few tests to the end."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items):
+    """Begin with the files that take longest, so that no worker is left with one of them."""
+    items.sort(key=lambda item: _LONGEST.index(item.path.stem) if item.path.stem in _LONGEST else len(_LONGEST))
 
 
 @pytest.fixture(autouse=True)
@@ -57,3 +79,4 @@ def command_settings(tmp_path, monkeypatch):
     yield
     for name, value in before.items():
         jax.config.update(name, value)
+    compilation_cache.reset_cache()  # once in use it would take the programs of all tests after this one, too

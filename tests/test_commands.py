@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scans import noise, problem
 
+import fitting
 import jaxsubdiv as js
 from fitting.__main__ import main as fit
 from jaxsubdiv.__main__ import main as refine
@@ -230,6 +231,65 @@ def test_fit_of_files_is_that_of_the_library(files, capsys):
     surface = js.read_mesh("deep/folder/surface.ply")
     np.testing.assert_allclose(surface.vertices, found.surface.vertices, rtol=1e-9, atol=1e-9)
     assert json.loads(Path("deep/folder/report.json").read_text()) == found.report(uncertainty=True).as_dict()
+
+
+def test_surface_is_written_as_finely_and_in_the_formats_that_are_asked_for(files, capsys):
+    import nibabel
+
+    options = ("--max-sweeps", 2, "--surface", "glb", "vtp", "gii", "surf", "stl", "obj", "ply", "--surface-level", 2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # quads are split, and coordinates rounded
+        assert run(fit, "scan.xyz", *GIVEN, *options, "-o", "out") == 1
+    files_of_it = ["glb", "vtp", "surf.gii", "shape.gii", "surf", "stl", "obj", "ply"]
+    written = ", ".join(f"surface.{name}" for name in files_of_it)
+    assert f"wrote    control.obj, {written}, report.json" in capsys.readouterr().out
+    at = fitting.load("out").at_level(2)
+    surface = js.read_mesh("out/surface.ply")
+    np.testing.assert_allclose(surface.vertices, at.surface.vertices, rtol=1e-9, atol=1e-9)
+    n_triangles = len(surface.faces[3]) + 2 * len(surface.faces[4])
+    assert surface.n_faces == 14 * 16
+    for name in ("glb", "surf.gii", "surf", "stl"):
+        mesh = js.read_mesh(f"out/surface.{name}")
+        assert len(mesh.faces[3]) == n_triangles and not len(mesh.faces[4])
+        np.testing.assert_allclose(np.sort(mesh.vertices, axis=0), np.sort(surface.vertices, axis=0), atol=1e-5)
+    arrays = nibabel.load("out/surface.shape.gii").darrays
+    assert [array.meta["Name"] for array in arrays] == ["distance_mm", "deviation_mm"]
+    np.testing.assert_allclose(arrays[0].data, at.distances, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(arrays[1].data, at.deviations, rtol=1e-4)
+    coarse = ("scan.xyz", *GIVEN, "--max-sweeps", 2, "-o", "out", "--surface-level", 0)
+    assert run(fit, *coarse, "--resume") == 2
+    assert "out holds a fit with another surface format or level" in capsys.readouterr().err
+    assert run(fit, *coarse) == 1
+    assert names(files / "out") == RESULTS  # those of the earlier fit are gone
+    np.testing.assert_allclose(
+        js.read_mesh("out/surface.ply").vertices, js.read_mesh("out/control.obj").vertices, rtol=1e-9
+    )
+
+
+def test_formats_that_cannot_be_written_are_told_before_the_fit(files, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "nibabel.gifti", None)
+    monkeypatch.setattr("fitting.run.fit_scan.fit_scan", None)  # never called
+    assert run(fit, "scan.xyz", *GIVEN, "--surface", "gii") == 2
+    assert ".gii files need nibabel" in capsys.readouterr().err
+    assert run(fit, "scan.xyz", *GIVEN, "--surface-level", 9) == 2
+    assert "--surface-level: a surface is written at a level from 0, the control mesh, to 8; got 9" in (
+        capsys.readouterr().err
+    )
+    with pytest.raises(SystemExit):
+        run(fit, "scan.xyz", *GIVEN, "--surface", "fbx")
+    assert "invalid choice: 'fbx'" in capsys.readouterr().err and not (files / "fit_scan").exists()
+
+
+def test_fit_is_kept_where_its_surface_has_no_such_level(files, capsys, monkeypatch):
+    def none(self):
+        raise ValueError("more memory than there is")
+
+    monkeypatch.setattr("fitting.report.at_level.SurfaceAtLevel.__post_init__", none)
+    monkeypatch.setattr("fitting.__main__.draw_fit", lambda *_, **__: (_ for _ in ()).throw(ImportError("left out")))
+    monkeypatch.setattr("fitting.__main__.write_page", lambda path, *_, **__: path.touch())
+    assert run(fit, "scan.xyz", *GIVEN, "--max-sweeps", 1, "-o", "out", "--surface-level", 3) == 1
+    assert "note     no surface: more memory than there is" in capsys.readouterr().out
+    assert names(files / "out") == [name for name in RESULTS if name not in ("surface.ply", "fit.png")]
 
 
 @pytest.mark.parametrize(

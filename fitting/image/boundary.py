@@ -1,11 +1,12 @@
 """The scan that an image is: points where the boundary of a label, or a grey value, crosses from voxel to voxel."""
 
-import warnings
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 from scipy.ndimage import gaussian_filter, map_coordinates
+
+from jaxsubdiv.notices import warn
 
 from ..scan.scan import Scan, ScanError
 from .volume import Label, Volume, mask_of
@@ -204,8 +205,7 @@ def _tell_thin(
     inside = map_coordinates(mask.astype(np.uint8), np.round(within).T, order=0, mode="nearest")
     thin = (inside == 0) & (outward != 0).any(axis=1)
     if thin.mean() > _MANY_THIN:
-        warnings.warn(
+        warn(
             f"label {label}: {thin.mean():.0%} of the boundary is of parts that are thinner than two voxels "
             f"({_THIN * step:.2g} mm). Look at them in the picture: they may have grown together or broken off.",
-            stacklevel=3,
         )

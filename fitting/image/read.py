@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxsubdiv.notices import warn
+
 from ..scan.scan import Scan, ScanError
 from ..scan.scan import read_scan as read_points
 from . import dicom_seg, meta_image, nifti, nrrd
@@ -165,5 +167,5 @@ def read_seen(
     except ScanError as error:
         raise ScanError(f"{path.name}: {error}") from None
     for one in told:
-        warnings.warn(f"{path.name}: {one.message}", one.category, stacklevel=3)
+        warn(f"{path.name}: {one.message}")
     return seen

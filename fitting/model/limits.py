@@ -30,6 +30,7 @@ _FACES = _Limit("it is a whole number of faces, from 4 to 10 million", 4, 1e7, w
 _SCALE = _Limit("it is a factor of coordinates, from 1e-9 to 1e9", 1e-9, 1e9)
 _LIMITS = {
     "levels": _Limit("a fit needs a topology of one level or more, and of 8 at most", 1, 8, whole=True),
+    "surface_level": _Limit("a surface is written at a level from 0, the control mesh, to 8", 0, 8, whole=True),
     "max_sweeps": _Limit("it is a whole number, from 0 to 100,000", 0, 1e5, whole=True),
     "tolerance": _Limit("it is a part of the surface's uncertainty, from 0, for all sweeps, to 1e3", 0, 1e3),
     "tolerance_mm": _LENGTH,

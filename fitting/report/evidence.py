@@ -121,15 +121,14 @@ def gather_evidence(
     """All that the checks look at."""
     look, scattered = fit.look, np.asarray(fit.scene.around.scattered)
     counted = (np.asarray(fit.scene.scan.weights_or_ones()) > 0) & ~scattered
-    noise, distances = float(look.noise), np.asarray(look.distances, np.float64)
     return Evidence(
         fit=fit,
         surface=surface,
         own=own_noise(np.asarray(look.pairs.points, np.float64), counted),
         edge=float(js.edge_length(fit.topology, fit.y.control.vertices)),
-        noise=noise,
-        distances=distances,
-        inliers=np.abs(distances) <= 3 * noise,
+        noise=float(look.noise),
+        distances=np.asarray(look.distances, np.float64),
+        inliers=fit.inliers,
         feet=at_pairs(np.asarray(surface.vertices, np.float64), look),
         sides=unit(at_pairs(np.asarray(surface.normals, np.float64), look)),
         areas=areas,

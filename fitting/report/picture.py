@@ -7,20 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 import jaxsubdiv as js
 from jaxsubdiv.console import printable
 
 from ..image.slices import Slice
-from ..scan.closest_points import nearest_rows
 from .result import FitResult
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLOURS = "RdBu_r"  # red where the scan lies outside of the surface, blue inside, white where they meet
-_NEAREST = 8
 
 
 def draw_fit(result: FitResult, start: js.ControlMesh, *, title: str = "", slices: Sequence[Slice] = ()) -> "Figure":
@@ -111,22 +108,9 @@ def _draw_slice(ax: Any, one: Slice, surface: js.RefinedSurface) -> None:
         ax.text(x, y, letter, transform=ax.transAxes, color="tab:cyan", ha="center", va="center", fontweight="bold")
 
 
-def surface_distances(result: FitResult) -> Float[np.ndarray, "v"]:
-    """Signed distance of the scan at every vertex of the surface, in mm: the mean of the nearest points' distances.
-
-    NaN farther from the scan than its points are from one another, many times over: there is nothing to tell there.
-    """
-    points, vertices = result.points, np.asarray(result.surface.vertices)
-    tree = KDTree(points)
-    spacing = np.median(nearest_rows(tree, points, min(2, len(points)))[0][:, -1])
-    away, nearest = nearest_rows(tree, vertices, min(_NEAREST, len(points)))
-    known = away[:, 0] <= 5 * spacing + np.abs(result.distances)[nearest[:, 0]]
-    return np.where(known, result.distances[nearest].mean(axis=1), np.nan)
-
-
 def _draw_error(ax: Any, result: FitResult, view: Float[np.ndarray, "3 3"]) -> None:
     limit = _limit(result, 98.0)
-    distances = surface_distances(result)
+    distances = result.at_level().distances
     colours = js.draw_surface(ax, result.surface, view=view, values=distances, limits=(-limit, limit), cmap=_COLOURS)
     ax.set_title("distance of the scan from it")
     below = ax.inset_axes((0.1, -0.08, 0.8, 0.03))

@@ -5,6 +5,9 @@ priors. With the strength of the bend prior found from the scan, its bands hold 
 average over the surface. Source: D. Nychka, Bayesian confidence intervals for smoothing splines, 1988.
 """
 
+import dataclasses
+import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +18,7 @@ from jaxsubdiv.linalg import unit
 
 from ..model.pairing import on_boundary
 from ..scan.closest_points import boundary_vertices
+from ..solve.elements import differentiate_across, face_corners
 from ..solve.strengths import neighbourhood_mean
 from .misfit import misfit_variances
 from .record import Fit
@@ -44,27 +48,58 @@ class Posterior:
 
     def uncertainty(self) -> Uncertainty:
         """Standard deviations across the surface, from the blocks of the covariance that its patches need."""
-        surface = self.fit.surface()
-        of_surface, of_control = self._surface_variances(surface), self._control_variances()
-        misfit = self._misfit_variances(surface, of_surface)
+        return self._uncertainty
+
+    @functools.cached_property
+    def _uncertainty(self) -> Uncertainty:
+        structure = self.equations.structure
+        of_control, of_surface = self._control_variances(), self._surface_variances
+        misfit = _at_vertices(self._misfit_of_faces, structure.corners, structure.patches.owner, len(of_surface))
         return Uncertainty(np.sqrt(of_control), np.sqrt(of_surface + misfit), np.sqrt(misfit))
 
-    def _surface_variances(self, surface: js.RefinedSurface) -> Float[np.ndarray, "w"]:
+    def deviations_of(self, topology: js.Topology) -> Float[np.ndarray, "w"]:
+        """`Uncertainty.surface` of the surface that the same control mesh has with other tables."""
+        fit, elements = self.fit, self.equations.structure.elements
+        model = dataclasses.replace(fit.model, topology=topology, priors=())
+        surface = model.refine(fit.y)
+        corners = face_corners(surface.faces)
+        owner = js.control_faces_of(model.scheme, topology, surface, fit.y.control)
+        face = np.zeros(len(surface.vertices), np.int64)
+        face[corners] = owner[:, None]
+        across = np.asarray(differentiate_across(model, fit.y, elements.seeds, surface.normals))
+        variances = self._variances(face, lambda rows: across[elements.seeds_of[face[rows]], rows[:, None]])
+        return np.sqrt(variances + _at_vertices(self._misfit_of_faces, corners, owner, len(variances)))
+
+    @functools.cached_property
+    def _surface_variances(self) -> Float[np.ndarray, "w"]:
         """Of every vertex of the surface along its normal."""
         structure, found = self.equations.structure, self.equations.found
-        patches, columns = structure.patches, self._free_columns(structure.elements.columns)
-        normals = np.asarray(surface.normals, np.float64)
+        normals, patches = np.asarray(self.fit.surface().normals, np.float64), structure.patches
         face, slot = np.zeros((2, len(normals)), np.int64)
         face[structure.corners], slot[structure.corners] = patches.owner[:, None], patches.slots
         by_surface = np.asarray(found.by_surface)
+        return self._variances(
+            face, lambda rows: np.einsum("vdx,vx->vd", by_surface[face[rows], slot[rows]], normals[rows])
+        )
+
+    def _variances(
+        self, face: Int[np.ndarray, "w"], derivatives: Callable[[Int[np.ndarray, "r"]], Float[np.ndarray, "r d"]]
+    ) -> Float[np.ndarray, "w"]:
+        """Of numbers that depend on the unknowns of a control face each.
+
+        Args:
+            face: that each number lies in.
+            derivatives: of some of the numbers by the unknowns of their faces.
+        """
+        columns = self._free_columns(self.equations.structure.elements.columns)
         order = np.argsort(face, kind="stable")
-        variances = np.zeros(len(normals))
+        ends, variances = np.searchsorted(face[order], np.arange(len(columns) + 1)), np.zeros(len(face))
         for first in range(0, len(columns), _FACES_AT_ONCE):
             those = slice(first, first + _FACES_AT_ONCE)
             blocks = self.factor.covariance_blocks(columns[those])
-            rows = order[slice(*np.searchsorted(face[order], (first, first + _FACES_AT_ONCE)))]
+            rows = order[ends[first] : ends[min(first + _FACES_AT_ONCE, len(columns))]]
             for some in np.array_split(rows, -(-len(rows) // _ROWS_AT_ONCE) or 1):
-                by = np.einsum("vdx,vx->vd", by_surface[face[some], slot[some]], normals[some])
+                by = derivatives(some)
                 variances[some] = np.einsum("vd,vde,ve->v", by, blocks[face[some] - first], by, optimize=True)
         return np.maximum(variances, 0)
 
@@ -93,12 +128,12 @@ class Posterior:
         is_free = np.append(np.asarray(self.fit.model.is_free)[:n] > 0, False)
         return np.where(is_free[columns], columns, -1)
 
-    def _misfit_variances(
-        self, surface: js.RefinedSurface, variances: Float[np.ndarray, "w"]
-    ) -> Float[np.ndarray, "w"]:
-        """Of the vertices of the surface, means of the control faces that they lie on."""
+    @functools.cached_property
+    def _misfit_of_faces(self) -> Float[np.ndarray, "f"]:
+        """Of the control faces, in mm^2."""
+        surface, variances = self.fit.surface(), self._surface_variances
         look, structure, topology = self.fit.look, self.equations.structure, self.fit.topology
-        corners, owner = structure.corners, structure.patches.owner
+        owner = structure.patches.owner
         pairs, open_vertices = look.pairs, boundary_vertices(surface)
         # Where a surface ends, distances run along it.
         counted = ~np.asarray(on_boundary(open_vertices, pairs.corners, pairs.corner_weights))
@@ -109,12 +144,7 @@ class Posterior:
         finer = range(len(topology.levels) - 1, -1, -1) if nested else []
         patches = [owner[face]] + [face // 4**level for level in finer]
         average, n_faces = neighbourhood_mean(topology), topology.n_control_faces
-        of_faces = misfit_variances(distances, weights, at_points, patches, average, n_faces)
-        once = np.append(np.ones((len(corners), 3)), corners[:, 3:] != corners[:, 2:3], axis=1)  # triangles repeat one
-        sums, counts = (
-            np.bincount(corners.ravel(), (once * of).ravel(), len(variances)) for of in (of_faces[owner][:, None], 1)
-        )
-        return sums / np.maximum(counts, 1)
+        return misfit_variances(distances, weights, at_points, patches, average, n_faces)
 
     def draws(self, n: int, seed: int = 0) -> Float[np.ndarray, "u n"]:
         """Random offsets of the unknowns, as probable as the posterior has them; see `Layout` for their order."""
@@ -122,3 +152,12 @@ class Posterior:
         drawn = self.factor.sample(np.random.default_rng(seed).normal(size=(size, n)))
         active = np.concatenate([np.ones(self.equations.structure.n, bool), self.fit.active])
         return drawn * (np.asarray(self.fit.model.is_free) * active)[:, None]
+
+
+def _at_vertices(
+    of_faces: Float[np.ndarray, "f"], corners: Int[np.ndarray, "g 4"], owner: Int[np.ndarray, "g"], n: int
+) -> Float[np.ndarray, "n"]:
+    """Of the vertices of a surface, means of the control faces that they lie on."""
+    once = np.append(np.ones((len(corners), 3)), corners[:, 3:] != corners[:, 2:3], axis=1)  # triangles repeat one
+    sums, counts = (np.bincount(corners.ravel(), (once * of).ravel(), n) for of in (of_faces[owner][:, None], 1))
+    return sums / np.maximum(counts, 1)

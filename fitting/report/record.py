@@ -79,6 +79,11 @@ class Fit:
         return np.minimum(self.hold, HOLD * self.loose)
 
     @property
+    def inliers(self) -> Bool[np.ndarray, "p"]:
+        """Points within three times the noise."""
+        return np.abs(np.asarray(self.look.distances, np.float64)) <= 3 * float(self.look.noise)
+
+    @property
     def likeness(self) -> float:
         """The likeness, as a mean over all bends: those of a mesh that was split are mostly not expected."""
         bend: Any = self.model.prior("bend")

@@ -17,6 +17,7 @@ from ..finding import Finding
 from ..model.pairing import make_scene
 from ..model.recipe import Settings
 from ..scan.scan import Scan
+from .at_level import SurfaceAtLevel
 from .coverage import distances_to_scan, vertex_areas, weighted_quantile, worst_places
 from .evidence import gather_evidence
 from .findings import find_what_speaks_against
@@ -85,11 +86,19 @@ class FitResult:
         surface together. Errors that neighbouring points share, as those of one contour, count as such a misfit. Shifts
         of slices count as unknown. Exact for up to 4,000 unknowns, else from random draws.
         """
-        return self._uncertainty
-
-    @functools.cached_property
-    def _uncertainty(self) -> Uncertainty:
         return self.posterior.uncertainty()
+
+    def at_level(self, levels: int | None = None) -> SurfaceAtLevel:
+        """The surface at another level of refinement, with the scan's distances and the uncertainty at its vertices.
+
+        Args:
+            levels: from 0, the control mesh itself, to 8; default: that of the fit.
+
+        Raises:
+            ValueError: there is no such level: the control mesh has creases, or h one value a level.
+        """
+        own = len(self.fit.topology.levels)
+        return SurfaceAtLevel(self.fit, own if levels is None else levels, lambda: self.posterior)
 
     @functools.cached_property
     def warnings(self) -> list[Finding]:
@@ -164,7 +173,7 @@ class FitResult:
 
     @property
     def inliers(self) -> Bool[np.ndarray, "p"]:
-        return np.abs(self.distances) <= 3 * self.noise
+        return self.fit.inliers
 
     def report(self, *, uncertainty: bool = False) -> Report:
         """The fit in numbers: `print` it, or take `.as_dict()`.

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from .fit import CHECKPOINT
 from .fit_scan import CHECKPOINT_START
+from .surface_files import SURFACE_FILES
 
 try:
     import fcntl
@@ -21,8 +22,10 @@ FIT = "fit.npz"
 LANDMARKS, CARRIED = "landmarks.mrk.json", "landmarks.csv"
 """Landmarks that were carried to the fit, for 3D Slicer and as a table; beside the summary, a table of those of all."""
 RESULTS = ("control.obj", "surface.ply", "report.json", "fit.html", "recipe.json", "fit.png", FIT)
+"""Of a fit without options."""
+_PLACED = (*SURFACE_FILES, LANDMARKS, CARRIED, *(name for name in RESULTS if name not in SURFACE_FILES))
 _UNFINISHED = ".unfinished-"  # the folders of `jaxsubdiv.files.replacing` and of `fill`
-_OURS = {*RESULTS, LANDMARKS, CARRIED, CHECKPOINT, CHECKPOINT_START, SUMMARY}
+_OURS = {*_PLACED, CHECKPOINT, CHECKPOINT_START, SUMMARY}
 
 
 def results_in(folder: Path) -> set[str]:
@@ -101,7 +104,7 @@ def filling(folder: Path) -> Iterator[Path]:
     new = Path(tempfile.mkdtemp(prefix=_UNFINISHED, dir=folder))
     try:
         yield new
-        for name in (LANDMARKS, CARRIED, *RESULTS):
+        for name in _PLACED:
             if (new / name).exists():
                 os.replace(new / name, folder / name)
             else:

@@ -11,6 +11,7 @@ from ..image.read import is_image, stem
 from .folder import CARRIED, SUMMARY, results_in
 
 _SCAN_FILES = {".ply", ".xyz", ".csv", ".txt", ".npz", ".vtp", ".vtk", ".stl", ".obj", ".off", ".gii"}
+_SCAN_FILES |= {".vtu", ".glb", ".pcd", ".pts", ".hsp"}
 _LONGEST = 200  # bytes: file systems take 255, and a file that is being written has a longer name
 
 

@@ -43,10 +43,16 @@ def scattered_points(points: Float[np.ndarray, "p 3"], dense: Bool[np.ndarray, "
     scattered = np.zeros(len(points), bool)
     if len(sparse):
         _, rows = nearest_rows(KDTree(points), points[sparse], min(_AROUND + 1, len(points)))
-        around = points[rows] - points[rows].mean(axis=1, keepdims=True)
-        spread = np.linalg.eigvalsh(np.matmul(around.transpose(0, 2, 1), around))
+        spread = np.linalg.eigvalsh(covariances(points, rows))
         scattered[sparse] = spread[:, 0] > _THICK**2 * spread[:, 2]
     return scattered
+
+
+def covariances(points: Float[np.ndarray, "p 3"], near: Int[np.ndarray, "q k"]) -> Float[np.ndarray, "q 3 3"]:
+    """How neighbourhoods, given by the rows of their points, spread about their middles."""
+    around = points[near]
+    around = around - around.mean(axis=1, keepdims=True)
+    return np.einsum("qka,qkb->qab", around, around, optimize=True) / near.shape[1]
 
 
 def neighbour_distance(points: Float[np.ndarray, "p 3"], k: int = NEIGHBOURS) -> Float[np.ndarray, "p"]:

@@ -181,8 +181,9 @@ def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[st
     """A scan from a file of points: PLY, XYZ, CSV, TXT, NPZ, VTP, or any mesh file, whose vertices are then the points.
 
     Faces of a mesh file are kept, see `Scan.faces`. A column `slice` of a CSV file, or another table with a header row,
-    numbers the slices. Points that are not finite are dropped, with a warning; see `jaxsubdiv.read_points` for all that
-    a file may hold. The frame is what the file says, see `jaxsubdiv.read_frame`.
+    numbers the slices, and `frameID` does so in guide points of biv-me (`GPFile_000.txt`). Points that are not finite
+    are dropped, with a warning; see `jaxsubdiv.read_points` for all that a file may hold. The frame is what the file
+    says, see `jaxsubdiv.read_frame`.
 
     Args:
         path: the file.

@@ -171,6 +171,17 @@ def differentiate(
     return Derivatives(surface, rows, by_rows, by_surface, (of_surface[-1], of_rows[-1]))
 
 
+@eqx.filter_jit
+def differentiate_across(
+    model: Model, y: Variables, seeds: Float[Array | np.ndarray, "s n"], normals: Float[Array, "v 3"]
+) -> Float[Array, "s v"]:
+    """How far each vertex of the surface moves along its normal, for a move of the unknowns along each seed."""
+    dtype, split = y.control.vertices.dtype, model.layout.split
+    zero = split(jnp.zeros(model.layout.n, dtype))
+    _, derivative = jax.linearize(lambda offset: model.refine(model.retract(y, offset)).vertices, zero)
+    return jax.lax.map(lambda seed: jnp.sum(derivative(split(seed)) * normals, axis=1), jnp.asarray(seeds, dtype))
+
+
 def forgets_some(elements: Elements, patches: Patches, found: Derivatives, row_faces: Int[np.ndarray, "m"]) -> bool:
     """Whether values depend on unknowns that the elements do not know: seen in the derivative along the last seed."""
     seed = np.append(elements.seeds[-1, : elements.n], 0.0)[elements.columns]

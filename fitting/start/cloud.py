@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from ..scan.closest_points import nearest_rows
-from ..scan.outliers import first_of_each, neighbour_distance, one_a_cell
+from ..scan.outliers import covariances, first_of_each, neighbour_distance, one_a_cell
 from ..scan.scan import Scan, ScanError
 from ..scan.slices import contour_spacing
 from .mesh_topology import component_labels
@@ -163,8 +163,7 @@ def _even_rows(points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, "q"]:
 def on_lines(points: Float[np.ndarray, "p 3"]) -> bool:
     """Whether most points have their neighbours on a line, as those of contours do."""
     _, near = nearest_rows(KDTree(points), points, min(NEIGHBOUR + 1, len(points)))
-    around = points[near] - points[near].mean(axis=1, keepdims=True)
-    spread = np.linalg.eigvalsh(np.matmul(around.transpose(0, 2, 1), around))
+    spread = np.linalg.eigvalsh(covariances(points, near))
     return bool(np.median(spread[:, 1] / np.maximum(spread[:, 2], np.finfo(float).tiny)) < _LINES)
 
 

@@ -16,6 +16,7 @@ from ..scan.scan import Scan, ScanError
 from .align import sample_faces
 from .cloud import Cloud, clean
 from .parts import Part, PartKind, choose, find_parts, points_of_others
+from .reconstruct import reconstruct_smoothly
 from .remesh import Coarse, Dense, coarsen, paired, relaxed
 
 FaceKind: TypeAlias = Literal["triangle", "quad"]
@@ -99,7 +100,16 @@ def make_control_mesh(scan: Scan, *, faces: int, kind: FaceKind, closed: bool | 
 
 
 def _mesh_of(part: Part, faces: int, kind: FaceKind) -> js.ControlMesh:
-    coarse = coarsen(part.dense, faces if kind == "triangle" else 2 * faces, part.topology)
+    triangles = faces if kind == "triangle" else 2 * faces
+    coarse = coarsen(part.dense, triangles, part.topology)
+    if coarse is None and (smooth := _without_handles(part, triangles)) is not None:
+        coarse = coarsen(smooth.dense, triangles, smooth.topology)
+        if coarse is not None:
+            warn(
+                f"{faces} faces are too few for what the scan shows ({part.topology}), so narrow handles were closed "
+                f"({smooth.topology}). Ask for more faces where they are true."
+            )
+            part = smooth
     if coarse is None:
         raise ScanError(
             f"{faces} faces are too few for what the scan shows ({part.topology}). Ask for more faces; if there should "
@@ -110,6 +120,19 @@ def _mesh_of(part: Part, faces: int, kind: FaceKind) -> js.ControlMesh:
     mesh = js.ControlMesh(vertices, {size: rows.astype(np.int32) for size, rows in coarse.faces.items()}, normals)
     _check_near(mesh, part)
     return mesh
+
+
+def _without_handles(part: Part, triangles: int) -> Part | None:
+    """The part with fewer handles, where its surface stays within two edges of so many triangles of the points; else
+    None."""
+    if not part.topology.genus:
+        return None
+    edge = np.sqrt(4 / 3**0.5 * part.dense.areas.sum() / triangles)
+    found = reconstruct_smoothly(part.cloud, part.topology.is_closed)
+    off = np.quantile(KDTree(found.pieces[0].vertices).query(part.cloud.points)[0], 0.95)
+    if found.topology.genus >= part.topology.genus or off > 2 * edge:
+        return None
+    return Part(found.cloud, found.pieces[0], found.topology)
 
 
 def _check_near(mesh: js.ControlMesh, part: Part) -> None:

@@ -7,6 +7,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.spatial import KDTree
 
 from ..scan.closest_points import nearest_rows
+from ..scan.outliers import covariances
 
 _NEIGHBOURS = 16
 
@@ -16,9 +17,7 @@ def plane_fits(
 ) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p"], Int[np.ndarray, "p k"]]:
     """Of every point and its `k` nearest: the normal of their plane, how far they lie off it (rms), and their rows."""
     _, rows = nearest_rows(KDTree(points), points, min(k, len(points)))
-    near = points[rows]
-    near = near - near.mean(axis=1, keepdims=True)
-    values, axes = np.linalg.eigh(np.einsum("pka,pkb->pab", near, near, optimize=True) / rows.shape[1])
+    values, axes = np.linalg.eigh(covariances(points, rows))
     return axes[:, :, 0], np.sqrt(np.maximum(values[:, 0], 0)), rows
 
 

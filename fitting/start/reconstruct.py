@@ -19,6 +19,7 @@ from .remesh import Dense
 
 _CELLS = 160  # along the longest side: a cortex needs them, or its folds grow together
 _SMOOTHER = (1.0, 1.5, 2.5)
+_SMOOTHEST = 4.0  # a handle that is true may go, too: only where no mesh of so few faces has room for those found
 _FAR_OFF = 5.0  # robust standard deviations from the surface
 _MAD = 1.4826
 # What is made up: farther from a point than this many times the distance to its tenth neighbour.
@@ -46,9 +47,18 @@ def reconstruct(cloud: Cloud, closed: bool | None) -> Reconstruction:
 
     Noise and stray points make handles as narrow as the grid; a true one is wider.
     """
+    return _smoothed_by(_SMOOTHER, cloud, closed)
+
+
+def reconstruct_smoothly(cloud: Cloud, closed: bool | None) -> Reconstruction:
+    """The surface at so much smoothing that hardly a handle is left."""
+    return _smoothed_by((_SMOOTHEST,), cloud, closed)
+
+
+def _smoothed_by(factors: tuple[float, ...], cloud: Cloud, closed: bool | None) -> Reconstruction:
     cloud, cell = _without_strays(cloud)
     best = None
-    for factor in _SMOOTHER:
+    for factor in factors:
         settled, implicit = settle(cloud, cell, factor)
         pieces = _pieces_of_surface(settled, implicit, closed)
         if not pieces:

@@ -17,6 +17,7 @@ _SOFTENED = 10  # rounds along a rim: over some cells of the grid that it was cu
 _RELAXED = 8
 _TRIES = (1.0, 1.04, 0.96, 1.1, 1.2)  # cluster counts, in parts of the wish: another one often cures a pinch
 _FINER = (2, 4, 8, 16, 32)
+_KEPT = 0.8  # of the clusters
 _COUNT = 0.03  # a rim, or a bubble that went, leaves fewer faces: asked for once more
 _AT_MOST = 1.2  # of the faces asked for
 
@@ -63,18 +64,28 @@ def coarsen(dense: Dense, n_triangles: int, topology: MeshTopology) -> Coarse | 
         found = _clustered(dense, n_vertices)
         if share == 1.0 and abs(len(found.faces[3]) / n_triangles - factor) > _COUNT and len(found.faces[3]):
             share = min(factor * n_triangles / len(found.faces[3]), 2.0)
-            found = _clustered(dense, round(share * n_vertices))
-        if _is_manifold(found) and face_topology(found.faces) == topology:
+            n_vertices = round(share * n_vertices)
+            found = _clustered(dense, n_vertices)
+        if _is_whole(found, n_vertices, topology):
             return found
     for finer in _FINER:
         # Deep folds lie closer than a cluster is wide: smaller ones keep the sheets apart, and are merged with care.
-        found = _clustered(dense, round(finer * max(n_triangles / 2 + euler, n_triangles / 4)))
-        if _is_manifold(found) and face_topology(found.faces) == topology:
+        n_vertices = round(finer * max(n_triangles / 2 + euler, n_triangles / 4))
+        found = _clustered(dense, n_vertices)
+        if _is_whole(found, n_vertices, topology):
             break
     else:
         return None
     found = _collapsed(found, n_triangles)
     return found if len(found.faces[3]) <= _AT_MOST * n_triangles else None
+
+
+def _is_whole(found: Coarse, n_vertices: int, topology: MeshTopology) -> bool:
+    """Whether it is a manifold of that topology, of hardly fewer vertices than asked for: a sheet that clusters of both
+    of its sides share falls apart, and the rest may be of the same topology."""
+    if len(found.vertices) < _KEPT * n_vertices or not _is_manifold(found):
+        return False
+    return face_topology(found.faces) == topology
 
 
 def _clustered(dense: Dense, n_vertices: int) -> Coarse:

@@ -19,11 +19,11 @@ from ..errors import MeshError, name_rows
 from ..files import replacing
 from ..frames import Frame
 from ..markups import read_control_points
-from . import _arrays, _freesurfer, _gifti, _markups, _obj, _off, _ply, _stl, _table, _vtk, _vtp
-from ._contents import Contents, VertexData, doubles, warn
+from . import _arrays, _digitiser, _freesurfer, _gifti, _glb, _markups, _obj, _off, _pcd, _ply, _stl, _table, _vtk, _vtp
+from ._contents import Contents, VertexData, doubles, library, warn
 from ._frame import find_space
 
-__all__ = ["PointCloud", "Surface", "read_frame", "read_mesh", "read_points", "write_mesh"]
+__all__ = ["PointCloud", "Surface", "check_can_write", "read_frame", "read_mesh", "read_points", "write_mesh"]
 
 
 class PointCloud(NamedTuple):
@@ -62,22 +62,33 @@ class _Format(NamedTuple):
     read_points: Callable[[Path], Contents]
     write: Callable[[Path, Contents, VertexData], None] | None
     holds_data: bool = False
+    library: str | None = None
+    """Of the extra `io`, that writing takes."""
 
 
 _TABLE = _Format(None, _table.read, None)
 _MARKUPS = _Format(None, _markups.read, None)
+_DIGITISER = _Format(None, _digitiser.read, None)
+_FREESURFER = _Format(_freesurfer.read_binary, _freesurfer.read_binary, _freesurfer.write)
+_GIFTI_DATA = _Format(_gifti.read, _gifti.read_points, _gifti.write_data, holds_data=True, library="nibabel.gifti")
 _FORMATS = {
     ".obj": _Format(_obj.read, _obj.read_points, _obj.write),
     ".ply": _Format(_ply.read, _ply.read_points, _ply.write, holds_data=True),
     ".off": _Format(_off.read, _off.read_points, _off.write),
     ".stl": _Format(_stl.read, _stl.read, _stl.write),
-    ".vtp": _Format(_vtp.read, _vtp.read_points, _vtk.write, holds_data=True),
-    ".vtk": _Format(_vtk.read, _vtk.read_points, _vtk.write, holds_data=True),
-    ".gii": _Format(_gifti.read, _gifti.read_points, _gifti.write),
+    ".vtp": _Format(_vtp.read, _vtp.read_points, _vtk.write, holds_data=True, library="pyvista"),
+    ".vtu": _Format(_vtp.read, _vtp.read_points, None),
+    ".vtk": _Format(_vtk.read, _vtk.read_points, _vtk.write, holds_data=True, library="pyvista"),
+    ".glb": _Format(_glb.read, _glb.read, _glb.write, holds_data=True),
+    ".shape.gii": _GIFTI_DATA,
+    ".gii": _Format(_gifti.read, _gifti.read_points, _gifti.write, library="nibabel.gifti"),
     ".npz": _Format(_arrays.read_npz, _arrays.read_points, _arrays.write),
-    ".asc": _Format(_freesurfer.read, _freesurfer.read_points, None),
+    ".asc": _Format(_freesurfer.read_text, _freesurfer.read_points, None),
+    **dict.fromkeys((".surf", ".white", ".pial", ".inflated", ".smoothwm", ".orig", ".sphere"), _FREESURFER),
     ".npy": _Format(None, _arrays.read_points, None),
-    **dict.fromkeys((".xyz", ".csv", ".txt"), _TABLE),
+    ".pcd": _Format(None, _pcd.read, None),
+    **dict.fromkeys((".xyz", ".csv", ".txt", ".pts", ".particles"), _TABLE),
+    **dict.fromkeys((".hsp", ".elp", ".pos"), _DIGITISER),
     **dict.fromkeys((".json", ".fcsv"), _MARKUPS),
 }
 
@@ -93,8 +104,13 @@ def read_mesh(path: str | os.PathLike[str], *, scale: float | int = 1.0, check: 
     - `.ply`: text, or binary of either byte order; other properties are left out.
     - `.off`: also NOFF; colours are left out.
     - `.stl`: text or binary; equal corners become one vertex; the normals of the facets are left out.
-    - `.vtp`, `.vtk`: polygons (legacy VTK: of a POLYDATA file).
-    - `.asc`: surfaces of FreeSurfer as text.
+    - `.vtp`, `.vtu`, `.vtk`: polygons and triangle strips, and the triangles and quads of unstructured grids; points
+      and lines are left out, and cells of volumes refused.
+    - `.surf`, `.white`, `.pial`, `.inflated`, `.smoothwm`, `.orig`, `.sphere`: binary surfaces of FreeSurfer, which
+      are known by their first bytes under any other name too (`lh.sphere.reg`). Coordinates stay surface RAS, as
+      stored; a warning says where the scanner's RAS is another. `.asc`: the same as text.
+    - `.glb`: the triangles of all meshes, as they are stored there: in metres as a rule, told where no `scale` is
+      given. A matrix that places a mesh is not applied, and a warning says so.
     - `.gii`: GIfTI. Coordinates stay as stored: a coordinate transform in the file that is not the
       identity is not applied, and a warning says so.
     - `.npz`: `control_points`, `control_faces`, `control_normals`; or `vertices`, `normals` and `faces`, or `triangles`
@@ -115,7 +131,7 @@ def read_mesh(path: str | os.PathLike[str], *, scale: float | int = 1.0, check: 
     if format_.read_mesh is None:
         raise MeshError(f"{path.name}: {path.suffix} files hold points without faces. Read it with `read_points`.")
     _check_scale(scale)
-    contents = format_.read_mesh(path)
+    contents = _told_unit(path, format_.read_mesh(path), scale)
     if contents.faces is None:
         raise MeshError(f"{path.name}: it holds points but no faces. Read it with `read_points`.")
     vertices = _numbers(path.name, "vertices", contents.vertices, (None, 3))
@@ -134,12 +150,16 @@ def read_points(path: str | os.PathLike[str], *, scale: float | int = 1.0) -> Po
 
     Every format of `read_mesh`, whose vertices are then the points, used or not, whatever its faces are; and:
 
-    - `.xyz`, `.csv`, `.txt`, `.asc`: one point a line; commas, semicolons, tabs or white space part the columns; `#`,
-      `//` and `;` begin comments. A header row names the columns, of `x y z nx ny nz weight` in any order, with units
-      or as ParaView writes them; others are left out. Without one the first three columns are x, y and z, and three
-      others are the normals where their lengths are near 1; a warning says what was left out. Decimals may have commas
-      where these do not part the columns; a first row may give the number of points.
+    - `.xyz`, `.csv`, `.txt`, `.asc`, `.pts` (Leica's, and digitisers'), `.particles` (ShapeWorks): one point a line;
+      commas, semicolons, tabs or white space part the columns; `#`, `//` and `;` begin comments. A header row names the
+      columns, of `x y z nx ny nz weight` in any order, with units or as ParaView and biv-me write them; others are left
+      out. Without one the first three columns are x, y and z, and three others are the normals where their lengths are
+      near 1; a warning says what was left out. Decimals may have commas where these do not part the columns; a first
+      row may give the number of points.
     - `.npz`: `points`, and `normals` and `weights` if present. `.npy`: one array `[p, 3]`.
+    - `.pcd`: text, binary or compressed; x, y, z and normal_x, normal_y, normal_z. A viewpoint is not applied.
+    - `.hsp`, `.elp`, `.pos`: heads traced with a Polhemus digitiser, fiducials among the points. Programs write the
+      first two in metres and the last in centimetres; without a `scale` a warning says so.
     - `.mrk.json`, `.fcsv`: control points of 3D Slicer, in the frame that the file names; a warning says which.
 
     Points that are not finite are dropped, and a warning counts them. Normals that are not finite become zero, which
@@ -164,7 +184,7 @@ def read_labelled_points(
     """The points of `read_points`, and columns of text beside them: those of the names that a table's header has."""
     path, format_ = _open(path)
     _check_scale(scale)
-    contents = format_.read_points(path)
+    contents = _told_unit(path, format_.read_points(path), scale)
     points = _scaled(_numbers(path.name, "points", contents.vertices, (None, 3)), scale)
     n = len(points)
     normals = None if contents.normals is None else _numbers(path.name, "normals", contents.normals, (n, 3))
@@ -203,6 +223,14 @@ def read_frame(path: str | os.PathLike[str]) -> Frame | None:
     return read_control_points(path).frame if format_ is _MARKUPS else find_space(path)
 
 
+def _told_unit(path: Path, contents: Contents, scale: float | int) -> Contents:
+    """The contents, after a warning where their format has a unit of its own and no scale was given."""
+    if contents.usual_unit is not None and scale == 1:
+        unit, to_mm = contents.usual_unit
+        warn(path, f"{path.suffix} files are in {unit} as a rule; a scale of {to_mm:g} takes these to mm.")
+    return contents
+
+
 def _present(path: Path, normals: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"] | None:
     """The normals, zero where they are not finite; None where no point has one."""
     finite = _finite_rows(normals)
@@ -221,9 +249,18 @@ def write_mesh(
 ) -> None:
     """Write a mesh to a file of the format that the suffix names, so that it reads back the same bit for bit.
 
-    Suffixes: `.obj`, `.ply`, `.off`, `.vtp`, `.vtk`, `.npz`; and, with less in them, `.stl`, which holds neither quads
-    (they are split, with a warning) nor normals nor vertices that no face uses, and `.gii`, which holds neither quads
-    (an error) nor double precision (a warning says by how much it rounds).
+    Suffixes: `.obj`, `.ply`, `.off`, `.vtp`, `.vtk`, `.npz`; and, with less in them, where quads are split with a
+    warning, and another says by how much coordinates are rounded to single precision:
+
+    - `.stl`: no normals, and no vertices that no face uses; not rounded.
+    - `.gii`: GIfTI, as Connectome Workbench opens it: no normals, which it allows no room, and vertex data in a file of
+      their own, `.shape.gii`, written of the same mesh.
+    - `.surf`, `.white`, `.pial` and the other names of FreeSurfer that `read_mesh` knows: no normals.
+    - `.glb`: glTF, for web pages and slides. The vertices are in mm as they are here, in a node that takes mm with z up
+      to the metres with y up that glTF has, x staying x, so that programs show the true size; `read_mesh` gives mm
+      again. Of the vertex data the first colour the surface: blue and red below and above 0 where there are both, dark
+      to bright otherwise, grey where a value is not finite. All are kept as attributes too, `_DISTANCE_MM` for
+      `distance_mm`; glTF has no NaN, so that these are 0 there, and so is `_DISTANCE_MM_KNOWN`, which is 1 elsewhere.
 
     The file appears, or takes the place of another, only once it is complete.
 
@@ -231,7 +268,7 @@ def write_mesh(
         path: the file; its folder must be there.
         mesh: a `ControlMesh` or a `RefinedSurface`.
         vertex_data: name -> one number a vertex, shape `[v]`, of any unit: distances, say. Kept by `.ply`, `.vtp` and
-            `.vtk`; an error elsewhere.
+            `.vtk`, `.glb` and `.shape.gii`; an error elsewhere.
         frame: what the axes are, where that is known: a comment of `.ply`, `.obj`, `.stl` and `.vtk` files says it to
             3D Slicer and `read_frame`, and the others leave it out.
 
@@ -244,19 +281,47 @@ def write_mesh(
     path = Path(path)
     if path.is_dir():
         raise MeshError(f"{path}: this is a folder. Name a file in it.")
-    format_ = _format(path)
-    if format_.write is None:
-        raise MeshError(
-            f"{path.name}: {path.suffix} files hold points without faces. Meshes go to {_suffixes('write')}."
-        )
+    format_, write = _writable(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, "the folder does not exist, create it first", str(path.parent))
     contents = _contents(path, mesh)._replace(frame=frame)
     data = _vertex_data(vertex_data or {}, len(contents.vertices))
-    if data and not format_.holds_data:
-        raise MeshError(f"{path.name}: {path.suffix} files hold no vertex data. Write {_suffixes('holds_data')}.")
+    if data:
+        _check_holds_data(path, format_)
     with replacing(path) as unfinished:
-        format_.write(unfinished, contents, data)
+        write(unfinished, contents, data)
+
+
+def check_can_write(path: str | os.PathLike[str], *, vertex_data: bool = False) -> None:
+    """See that `write_mesh` knows the suffix and has its library, before there is a mesh to write.
+
+    Args:
+        path: the file; neither it nor its folder need be there.
+        vertex_data: whether it is to hold some.
+
+    Raises:
+        MeshError: meshes are not written to files of this suffix, or not with vertex data.
+        ImportError: a library of the extra `io` is not installed.
+    """
+    path = Path(path)
+    format_, _ = _writable(path)
+    if vertex_data:
+        _check_holds_data(path, format_)
+    if format_.library is not None:
+        library(format_.library, f"{path.suffix} files")
+
+
+def _writable(path: Path) -> tuple[_Format, Callable[[Path, Contents, VertexData], None]]:
+    format_ = _format(path)
+    if format_.write is None:
+        held = "points without faces" if format_.read_mesh is None else "meshes that are only read"
+        raise MeshError(f"{path.name}: {path.suffix} files hold {held}. Meshes go to {_suffixes('write')}.")
+    return format_, format_.write
+
+
+def _check_holds_data(path: Path, format_: _Format) -> None:
+    if not format_.holds_data:
+        raise MeshError(f"{path.name}: {path.suffix} files hold no vertex data. Write {_suffixes('holds_data')}.")
 
 
 def _open(path: str | os.PathLike[str]) -> tuple[Path, _Format]:
@@ -266,14 +331,23 @@ def _open(path: str | os.PathLike[str]) -> tuple[Path, _Format]:
         raise MeshError(f"{path}: this is a folder. Name a file in it.")
     if not path.exists():
         raise FileNotFoundError(errno.ENOENT, "no such file", str(path))
-    format_ = _format(path)
+    known = _known_format(path)
+    if known is None and _freesurfer.is_binary(path):  # `lh.sphere.reg` and the like
+        known = _FREESURFER
+    format_ = known or _format(path)
     if path.stat().st_size == 0:
         raise MeshError(f"{path.name}: the file is empty. Was it copied to its end?")
     return path, format_
 
 
+def _known_format(path: Path) -> _Format | None:
+    """The format of a suffix, which may have two parts."""
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    return _FORMATS.get("".join(suffixes[-2:])) or _FORMATS.get(path.suffix.lower())
+
+
 def _format(path: Path) -> _Format:
-    format_ = _FORMATS.get(path.suffix.lower())
+    format_ = _known_format(path)
     if format_ is None:
         raise MeshError(
             f"{path.name}: the suffix '{path.suffix}' is not known. Meshes: {_suffixes('read_mesh')}. Points, besides: "
@@ -283,7 +357,10 @@ def _format(path: Path) -> _Format:
 
 
 def _suffixes(able_to: str) -> str:
-    return ", ".join(suffix for suffix, format_ in _FORMATS.items() if getattr(format_, able_to))
+    able = {suffix: format_ for suffix, format_ in _FORMATS.items() if getattr(format_, able_to)}
+    return ", ".join(
+        suffix for suffix, format_ in able.items() if format_ is not _GIFTI_DATA or able_to == "holds_data"
+    )
 
 
 def _check_scale(scale: float | int) -> None:

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Float32, Int, Shaped
 
 from .. import notices
 from ..errors import MeshError, name_rows
@@ -26,6 +26,8 @@ class Contents(NamedTuple):
     """Columns of text beside the points, by heading."""
     frame: Frame | None = None
     """What the axes are, where that is known."""
+    usual_unit: tuple[str, float] | None = None
+    """The unit that programs of the format write, and the scale that takes it to mm; None where it says nothing."""
 
 
 VertexData = Mapping[str, Shaped[np.ndarray, "v"]]
@@ -52,6 +54,28 @@ def doubles(values: Shaped[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """A copy in float64; what is not finite there is so without a warning, to be named later by its row."""
     with np.errstate(invalid="ignore", over="ignore"):
         return values.astype(np.float64)
+
+
+def triangles_only(path: Path, format_: str, contents: Contents) -> Int[np.ndarray, "t 3"]:
+    """The faces for a format that holds no quads: these are split in two, and a warning says so."""
+    faces = contents.faces or {}
+    triangles, quads = faces.get(3, np.zeros((0, 3), int)), faces.get(4, np.zeros((0, 4), int))
+    if not len(quads):
+        return triangles
+    warn(path, f"{format_} holds triangles only: {len(quads)} quads were split in two along their first diagonal.")
+    return np.concatenate([triangles, quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
+def in_single_precision(path: Path, format_: str, vertices: Float[np.ndarray, "v 3"]) -> Float32[np.ndarray, "v 3"]:
+    """The vertices for a format that knows no other precision; a warning says by how much they were rounded."""
+    with np.errstate(over="ignore"):
+        single = vertices.astype(np.float32)
+    if not np.isfinite(single).all():
+        raise MeshError(f"{path.name}: {format_} holds single precision, and coordinates are beyond it. Scale them.")
+    rounding = np.abs(single - vertices).max(initial=0)
+    if rounding > 0:
+        warn(path, f"{format_} holds single precision: coordinates were rounded, by up to {rounding:.1e}.")
+    return single
 
 
 def check_polygons(path: Path, sizes: Int[np.ndarray, "f"]) -> None:

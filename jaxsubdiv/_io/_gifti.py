@@ -14,7 +14,16 @@ from jaxtyping import Float, Shaped
 
 from ..errors import MeshError
 from . import _xml
-from ._contents import Contents, VertexData, doubles, library, warn, whole
+from ._contents import (
+    Contents,
+    VertexData,
+    doubles,
+    in_single_precision,
+    library,
+    triangles_only,
+    warn,
+    whole,
+)
 from ._text import parse_rows
 
 _NORMALS = "Normals"
@@ -133,24 +142,34 @@ def _unknown(what: str) -> NoReturn:
 
 
 def write(path: Path, contents: Contents, data: VertexData) -> None:
-    """Triangles, in single precision: the standard knows no other. A warning says by how much it rounds."""
-    faces = contents.faces or {}
-    if len(faces.get(4, ())):
-        raise MeshError(
-            f"{path.name}: GIfTI holds triangles only, and the mesh has {len(faces[4])} quads. Write .obj, .ply, .off, "
-            ".vtp, .vtk or .npz, which hold quads."
-        )
+    """Triangles, in single precision: the standard knows no other. A warning says by how much it rounds.
+
+    No normals: Connectome Workbench opens no surface with more arrays than two.
+    """
     gifti = library("nibabel.gifti", ".gii files")
-    vertices = contents.vertices.astype(np.float32)
-    rounding = np.abs(vertices - contents.vertices).max(initial=0)
-    if rounding > 0:
-        warn(path, f"GIfTI holds single precision: coordinates were rounded, by up to {rounding:.1e}.")
+    vertices = in_single_precision(path, "GIfTI", contents.vertices)
+    triangles = triangles_only(path, "GIfTI", contents).astype(np.int32)
     arrays = [
         gifti.GiftiDataArray(vertices, "NIFTI_INTENT_POINTSET", "NIFTI_TYPE_FLOAT32"),
-        gifti.GiftiDataArray(faces[3].astype(np.int32), "NIFTI_INTENT_TRIANGLE", "NIFTI_TYPE_INT32"),
+        gifti.GiftiDataArray(triangles, "NIFTI_INTENT_TRIANGLE", "NIFTI_TYPE_INT32"),
     ]
-    if contents.normals is not None:
-        normals = contents.normals.astype(np.float32)
-        meta = gifti.GiftiMetaData({"Name": _NORMALS})
-        arrays.append(gifti.GiftiDataArray(normals, "NIFTI_INTENT_VECTOR", "NIFTI_TYPE_FLOAT32", meta=meta))
+    path.write_bytes(gifti.GiftiImage(darrays=arrays).to_bytes())
+
+
+def write_data(path: Path, contents: Contents, data: VertexData) -> None:
+    """The vertex data alone, an array each, as the measurements that go with a `.surf.gii`."""
+    gifti = library("nibabel.gifti", ".gii files")
+    if not data:
+        raise MeshError(
+            f"{path.name}: such files hold vertex data alone. Give some, or write the surface to .surf.gii."
+        )
+    arrays = [
+        gifti.GiftiDataArray(
+            column.astype(np.float32),
+            "NIFTI_INTENT_SHAPE",
+            "NIFTI_TYPE_FLOAT32",
+            meta=gifti.GiftiMetaData({"Name": name}),
+        )
+        for name, column in data.items()
+    ]
     path.write_bytes(gifti.GiftiImage(darrays=arrays).to_bytes())

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from ..errors import MeshError, name_rows
 from ..tables import decode
-from ._contents import Contents, VertexData, doubles, warn
+from ._contents import Contents, VertexData, doubles, triangles_only, warn
 from ._frame import space_words
 from ._text import parse_rows
 
@@ -45,13 +45,7 @@ def read(path: Path) -> Contents:
 
 def write(path: Path, contents: Contents, data: VertexData) -> None:
     """Triangles, without rounding: binary where single precision holds every coordinate, otherwise text."""
-    faces = contents.faces or {}
-    triangles = faces.get(3, np.zeros((0, 3), int))
-    quads = faces.get(4, np.zeros((0, 4), int))
-    if len(quads):
-        warn(path, f"STL holds triangles only: {len(quads)} quads were split in two along their first diagonal.")
-        triangles = np.concatenate([triangles, quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    corners = contents.vertices[triangles]
+    corners = contents.vertices[triangles_only(path, "STL", contents)]
     with np.errstate(over="ignore", invalid="ignore"):
         single = corners.astype(np.float32)
     title = f"jaxsubdiv {space_words(contents.frame)}".strip()

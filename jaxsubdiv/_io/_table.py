@@ -19,7 +19,10 @@ _ALIASES = (
     (re.compile(f"(?:normals?|norm|n){_AXIS}"), "n"),
     (re.compile(r"(weight)s?"), ""),
     (re.compile(r"(label|contour)[ _-](?:type|name)"), ""),
+    (re.compile(r"(slice|frame)[ _-]?id"), ""),  # guide points of biv-me number the images by the second
 )
+_SHORT = {"0": "x", "1": "y", "2": "z", "frame": "slice"}
+_MOMENT = re.compile(r"(time[ _-]?)?frame|phase")
 _NEAR_ONE = 0.05  # normals written with two digits have lengths as far from 1
 
 
@@ -45,6 +48,10 @@ def _by_headings(path: Path, table: Table) -> Contents:
             "names are left out."
         )
     texts = {name: table.texts(place) for place, name in enumerate(names) if name not in known}
+    for name, column in texts.items():
+        if _MOMENT.fullmatch(name) and (n := len(set(column))) > 1:
+            warn(path, f"the column '{name}' has {n} different values: points of several moments are read as one scan. "
+                 "Give each moment a file of its own.")  # fmt: skip
     place = {name: names.index(name) for name in known}
     points = table.numbers([place[name] for name in _POSITION])
     normals = table.numbers([place[name] for name in _NORMAL]) if n_normal else None
@@ -56,7 +63,7 @@ def _known_name(heading: str) -> str:
     """`x` for `Points:0`, `x coordinate` and the like; other headings stay."""
     for pattern, before in _ALIASES:
         if found := pattern.fullmatch(heading):
-            return before + {"0": "x", "1": "y", "2": "z"}.get(found[1], found[1])
+            return before + _SHORT.get(found[1], found[1])
     return heading
 
 

@@ -1,4 +1,4 @@
-"""Legacy VTK files of polygons; and how VTK writes these and VTP files.
+"""Legacy VTK files of surfaces; and how VTK writes these and VTP files.
 
 Not read by VTK: counts that a file only announces end the interpreter there.
 """
@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Int, Shaped
 
 from ..errors import MeshError, name_rows
-from ._contents import Contents, VertexData, by_size, check_polygons, doubles, library
+from ._cells import polygons, strips, surface_cells, with_triangles
+from ._contents import Contents, VertexData, doubles, library
 from ._frame import space_words
 from ._text import parse_numbers, token_starts
 
@@ -21,7 +22,7 @@ _TYPES = {
     **{"unsigned_long": "u8", "long": "i8", "float": "f4", "double": "f8", "vtkidtype": "i4"},
     **{f"vtktype{sign}int{8 * n}": f"{'u' if sign else 'i'}{n}" for sign in ("", "u") for n in (1, 2, 4, 8)},
 }
-_CELLS = ("vertices", "lines", "polygons", "triangle_strips")
+_CELLS = ("vertices", "lines", "polygons", "triangle_strips", "cells")
 _VECTORS = {
     "normals": 3,
     "vectors": 3,
@@ -112,33 +113,21 @@ class _Cursor:
 
 
 def read(path: Path) -> Contents:
-    """Points, polygons, and the point normals: the array marked as such, or the one called Normals."""
-    contents, cells = _read(path)
-    strips, _ = cells.get("triangle_strips", ([], []))
-    if len(strips):
-        raise MeshError(
-            f"{path.name}: it holds {len(strips)} triangle strips, which are not read. Save it as polygons: "
-            "pyvista.read(...).triangulate().save(...)."
-        )
-    return contents._replace(faces=polygons(path, *cells["polygons"]) if "polygons" in cells else None)
+    """Points, faces, and the point normals: the array marked as such, or the one called Normals."""
+    contents, cells, types = _read(path)
+    if "cells" in cells:
+        n = len(cells["cells"][0])
+        if len(types) != n:
+            raise MeshError(f"{path.name}: it has {n} CELLS, but {len(types)} CELL_TYPES. It is cut off or damaged.")
+        return contents._replace(faces=surface_cells(path, types, *cells["cells"]))
+    none = np.zeros(0, int), np.zeros(0, int)
+    more = strips(path, *cells.get("triangle_strips", none))
+    return contents._replace(faces=with_triangles(polygons(path, *cells.get("polygons", none)), more))
 
 
 def read_points(path: Path) -> Contents:
     """Points and their normals, whatever cells they have."""
     return _read(path)[0]
-
-
-def polygons(
-    path: Path, ends: Int[np.ndarray, "f"], corners: Int[np.ndarray, "c"]
-) -> dict[int, Int[np.ndarray, "_ _"]] | None:
-    """Faces whose corners end at `ends`; None where there are none."""
-    if len(ends) == 0:
-        return None
-    sizes = np.diff(ends, prepend=0)
-    check_polygons(path, sizes)
-    if ends[-1] > len(corners):
-        raise MeshError(f"{path.name}: the faces need {ends[-1]} corners, but there are {len(corners)}. It is damaged.")
-    return by_size(corners, ends - sizes, sizes)
 
 
 def write(path: Path, contents: Contents, data: VertexData) -> None:
@@ -166,8 +155,11 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
         raise OSError(f"{path.name}: VTK could not write the file: {messages or 'it gives no reason'}")
 
 
-def _read(path: Path) -> tuple[Contents, dict[str, tuple[Int[np.ndarray, "f"], Int[np.ndarray, "c"]]]]:
-    """Points with their normals; and by the kind of the cells where the corners of each end, and the corners."""
+def _read(
+    path: Path,
+) -> tuple[Contents, dict[str, tuple[Int[np.ndarray, "f"], Int[np.ndarray, "c"]]], Int[np.ndarray, "n"]]:
+    """Points with their normals; by the kind of the cells where the corners of each end, and the corners; and the type
+    of each cell of an unstructured grid."""
     cursor = _Cursor(path, path.read_bytes())
     if not cursor.line().lower().startswith("# vtk datafile version"):
         raise MeshError(
@@ -179,19 +171,21 @@ def _read(path: Path) -> tuple[Contents, dict[str, tuple[Int[np.ndarray, "f"], I
         cursor.refuse("the third line must be ASCII or BINARY")
     cursor.is_text = kind == ["ascii"]
     points, normals, cells, of_points = None, {}, {}, False
-    n_tuples = 0
+    n_tuples, types = 0, np.zeros(0, int)
     while words := cursor.words():
         match words[0]:
             case "dataset":
-                if words[1:] != ["polydata"]:
+                if words[1:] not in (["polydata"], ["unstructured_grid"]):
                     raise MeshError(
-                        f"{path.name}: it holds a {' '.join(words[1:])[:40].upper()}, not polygons. Take its surface "
+                        f"{path.name}: it holds a {' '.join(words[1:])[:40].upper()}, not faces. Take its surface "
                         "first: pyvista.read(...).extract_surface().save(...)."
                     )
             case "points":
                 points = cursor.numbers(3 * cursor.count(words, 1), words[-1]).reshape(-1, 3)
             case name if name in _CELLS:
                 cells[name] = _read_cells(cursor, words)
+            case "cell_types":
+                types = _whole(cursor, cursor.numbers(cursor.count(words, 1), "int"))
             case "cell_data" | "point_data":
                 n_tuples, of_points = cursor.count(words, 1), words[0] == "point_data"
             case "metadata":
@@ -203,9 +197,9 @@ def _read(path: Path) -> tuple[Contents, dict[str, tuple[Int[np.ndarray, "f"], I
                     break  # how long the rest is nobody knows; only attributes come this late
                 normals |= found if of_points else {}
     if points is None:
-        raise MeshError(f"{path.name}: it has no POINTS. It is cut off, or no POLYDATA file.")
+        raise MeshError(f"{path.name}: it has no POINTS. It is cut off, or no file of a surface.")
     fitting = [rows for _, rows in sorted(normals.items()) if rows.shape == points.shape]
-    return Contents(doubles(points), None, doubles(fitting[0]) if fitting else None), cells
+    return Contents(doubles(points), None, doubles(fitting[0]) if fitting else None), cells, types
 
 
 def _read_cells(cursor: _Cursor, words: list[str]) -> tuple[Int[np.ndarray, "f"], Int[np.ndarray, "c"]]:

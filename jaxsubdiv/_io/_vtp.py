@@ -1,4 +1,4 @@
-"""VTP files: VTK's polygons as XML. VTK writes them, see `_vtk`.
+"""VTP and VTU files: VTK's polygons and unstructured grids as XML. VTK writes the first, see `_vtk`.
 
 Not read by VTK: counts that a file only announces end the interpreter there.
 """
@@ -14,9 +14,9 @@ from jaxtyping import Int, Shaped
 
 from ..errors import MeshError
 from . import _xml
+from ._cells import polygons, strips, surface_cells, with_triangles
 from ._contents import Contents, doubles, whole
 from ._text import parse_rows
-from ._vtk import polygons
 
 _TYPES = {
     **{f"{sign}Int{8 * n}": f"{'u' if sign else 'i'}{n}" for sign in ("", "U") for n in (1, 2, 4, 8)},
@@ -30,6 +30,8 @@ _PACKERS = {None: None, "vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor"
 
 class _File(NamedTuple):
     path: Path
+    kind: str
+    """PolyData or UnstructuredGrid."""
     root: Element
     appended: bytes
     """What follows the underscore of the appended data."""
@@ -40,17 +42,12 @@ class _File(NamedTuple):
 
 
 def read(path: Path) -> Contents:
-    """Points, polygons, and the point normals: the array marked as such, or the one called Normals."""
+    """Points, faces, and the point normals: the array marked as such, or the one called Normals."""
     file = _open(path)
     contents, faces, n_before = [], [], 0
     for piece in _pieces(file):
-        if _count(file, piece, "NumberOfStrips"):
-            raise MeshError(
-                f"{path.name}: it holds {piece.get('NumberOfStrips')} triangle strips, which are not read. Save it as "
-                "polygons: pyvista.read(...).triangulate().save(...)."
-            )
         contents.append(_points(file, piece))
-        blocks = _polygons(file, piece, _count(file, piece, "NumberOfPolys"))
+        blocks = _grid_faces(file, piece) if file.kind == "UnstructuredGrid" else _faces(file, piece)
         faces += [{size: block + n_before for size, block in blocks.items()}] if blocks else []
         n_before += len(contents[-1].vertices)
     joined = {size: np.concatenate([blocks[size] for blocks in faces]) for size in (3, 4)} if faces else None
@@ -70,18 +67,19 @@ def _open(path: Path) -> _File:
         data = data[: found.start()] + b"</VTKFile>"
         appended = appended[: max(appended.rfind(b"</AppendedData"), 0) or None]
     root = _xml.parse(path, data, "VTKFile")
-    if root.get("type") != "PolyData":
+    kind = root.get("type", "")
+    if kind not in ("PolyData", "UnstructuredGrid"):
         raise MeshError(
-            f"{path.name}: it holds a {str(root.get('type'))[:40]}, not polygons. Take its surface first: "
+            f"{path.name}: it holds a {kind[:40]}, not polygons. Take its surface first: "
             "pyvista.read(...).extract_surface().save(...)."
         )
     found = [array.get("offset", "") for array in root.iter("DataArray")]
     offsets = sorted({int(offset) for offset in found if _COUNT.fullmatch(offset)} | {len(appended)})
-    return _File(path, root, appended, is_raw, offsets)
+    return _File(path, kind, root, appended, is_raw, offsets)
 
 
 def _pieces(file: _File) -> list[Element]:
-    pieces = file.root.findall("PolyData/Piece")
+    pieces = file.root.findall(f"{file.kind}/Piece")
     if not pieces:
         raise MeshError(f"{file.path.name}: it has no element 'Piece', so no points. It is damaged.")
     return pieces
@@ -104,14 +102,33 @@ def _points(file: _File, piece: Element) -> Contents:
     return Contents(doubles(points), None, doubles(_array(file, marked[0], 3 * n).reshape(-1, 3)) if marked else None)
 
 
-def _polygons(file: _File, piece: Element, n: int) -> dict[int, Int[np.ndarray, "_ _"]] | None:
-    arrays = {array.get("Name"): array for array in piece.findall("Polys/DataArray")}
+def _faces(file: _File, piece: Element) -> dict[int, Int[np.ndarray, "_ _"]] | None:
+    """Polygons and the triangles of strips, of a piece of polygons."""
+    faces = polygons(file.path, *_cells(file, piece, "Polys", _count(file, piece, "NumberOfPolys")))
+    more = strips(file.path, *_cells(file, piece, "Strips", _count(file, piece, "NumberOfStrips")))
+    return with_triangles(faces, more)
+
+
+def _grid_faces(file: _File, piece: Element) -> dict[int, Int[np.ndarray, "_ _"]] | None:
+    """Triangles and quads of a piece of an unstructured grid."""
+    n = _count(file, piece, "NumberOfCells")
     if not n:
         return None
+    types = next((array for array in piece.findall("Cells/DataArray") if array.get("Name") == "types"), None)
+    if types is None:
+        raise MeshError(f"{file.path.name}: the element 'Cells' needs the array 'types'.")
+    return surface_cells(file.path, whole(file.path, _array(file, types, n)), *_cells(file, piece, "Cells", n))
+
+
+def _cells(file: _File, piece: Element, name: str, n: int) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "c"]]:
+    """Where the corners of each of the `n` cells end, and the corners."""
+    arrays = {array.get("Name"): array for array in piece.findall(f"{name}/DataArray")}
+    if not n:
+        return np.zeros(0, int), np.zeros(0, int)
     if not {"offsets", "connectivity"} <= arrays.keys():
-        raise MeshError(f"{file.path.name}: the element 'Polys' needs the arrays 'connectivity' and 'offsets'.")
+        raise MeshError(f"{file.path.name}: the element '{name}' needs the arrays 'connectivity' and 'offsets'.")
     ends = whole(file.path, _array(file, arrays["offsets"], n))
-    return polygons(file.path, ends, whole(file.path, _array(file, arrays["connectivity"], max(int(ends[-1]), 0))))
+    return ends, whole(file.path, _array(file, arrays["connectivity"], max(int(ends[-1]), 0)))
 
 
 def _join(parts: list[Contents]) -> Contents:

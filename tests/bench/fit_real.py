@@ -26,7 +26,6 @@ from trimesh import Trimesh
 
 import fitting
 import jaxsubdiv as js
-from fitting.report.picture import surface_distances
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 NOISE = 3.0  # mm: what `jaxsubdiv-fit` moves the control mesh of its example by
@@ -167,7 +166,7 @@ def draw_montage(names: Sequence[str], pictures: Path) -> None:
         view = js.view_of(result.surface, CASES[name].towards)
         js.draw_surface(above, result.control_mesh, view=view, edges=True)
         above.set_title(f"{name}\n{result.scan.n_points:,} points, {len(result.control.vertices):,} vertices", size=10)
-        values = surface_distances(result)
+        values = result.at_level().distances
         limit = float(np.percentile(np.abs(result.distances), 95))
         colours = js.draw_surface(
             below, result.surface, view=view, values=values, limits=(-limit, limit), cmap="RdBu_r"

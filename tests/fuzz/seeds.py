@@ -61,7 +61,7 @@ def _written() -> dict[str, bytes]:
     mesh = js.ControlMesh(_BOX, {3: _TRIANGLES}, np.float32(_BOX - 0.5))
     found = {}
     with tempfile.TemporaryDirectory() as folder:
-        for suffix in (".obj", ".ply", ".off", ".stl", ".vtp", ".vtk", ".gii", ".npz"):
+        for suffix in (".obj", ".ply", ".off", ".stl", ".vtp", ".vtk", ".gii", ".npz", ".surf", ".glb"):
             path = Path(folder, "own" + suffix)
             js.write_mesh(path, mesh)
             found[path.name] = path.read_bytes()
@@ -99,14 +99,50 @@ def _texts() -> dict[str, bytes]:
         + _lines(np.insert(_TRIANGLES, 3, 0, axis=1)),
     }
     big = b"".join(struct.pack(">B", 1) + struct.pack(">B4i", 4, *face) for face in _QUADS)
-    return {name: text.encode() for name, text in texts.items()} | {
-        "big.ply": ply.format("binary_big_endian").encode() + _BOX.astype(">f4").tobytes() + big,
-        "old_binary.vtk": (head.format("BINARY") + "POINTS 8 float\n").encode()
-        + (_BOX.astype(">f4").tobytes() + b"\nPOLYGONS 6 30\n" + cells.astype(">i4").tobytes() + b"\n"),
-        "packed.vtp": _vtp(packed=True),
-        "appended.vtp": _vtp(packed=False),
-        "plain.gii": _gifti(),
+    return (
+        {name: text.encode() for name, text in texts.items()}
+        | {
+            "big.ply": ply.format("binary_big_endian").encode() + _BOX.astype(">f4").tobytes() + big,
+            "old_binary.vtk": (head.format("BINARY") + "POINTS 8 float\n").encode()
+            + (_BOX.astype(">f4").tobytes() + b"\nPOLYGONS 6 30\n" + cells.astype(">i4").tobytes() + b"\n"),
+            "packed.vtp": _vtp(packed=True),
+            "appended.vtp": _vtp(packed=False),
+            "plain.gii": _gifti(),
+            "lh.white": _freesurfer(),
+        }
+        | _grids()
+    )
+
+
+def _freesurfer() -> bytes:
+    """With lines after the faces that say which image it was made from."""
+    info = "valid = 1  # volume info valid\nfilename = a.mgz\nvolume = 256 256 256\nxras = 1 0 0\ncras = 1.5 0 -2\n"
+    head = b"\xff\xff\xfecreated by nobody\n\n" + struct.pack(">2i", 8, 12) + _BOX.astype(">f4").tobytes()
+    return head + _TRIANGLES.astype(">i4").tobytes() + struct.pack(">3i", 2, 0, 20) + info.encode()
+
+
+def _grids() -> dict[str, bytes]:
+    """Unstructured grids of quads, triangles and a line, and triangle strips."""
+    points, strip = _lines(_BOX), "0 2 1 3 5 7"
+    cells = "2 0 1\n" + _lines(np.insert(_QUADS[:5], 0, 4, axis=1)) + "3 1 3 7\n3 1 7 5\n"
+    head = "# vtk DataFile Version 3.0\na box\nASCII\nDATASET {}\nPOINTS 8 float\n" + points
+    xml = (
+        '<VTKFile type="{}"><{}><Piece NumberOfPoints="8" {}><Points><DataArray type="Float32" NumberOfComponents="3" '
+    )
+    xml += f'format="ascii">{points}</DataArray></Points><{{}}>'
+    array = '<DataArray type="Int64" Name="{}" format="ascii">{}</DataArray>'
+    grid = xml.format("UnstructuredGrid", "UnstructuredGrid", 'NumberOfCells="8"', "Cells")
+    grid += array.format("connectivity", "0 1 " + _lines(_QUADS[:5]) + "1 3 7 1 7 5")
+    grid += array.format("offsets", "2 6 10 14 18 22 25 28") + array.format("types", "3 9 9 9 9 9 5 5")
+    strips = xml.format("PolyData", "PolyData", 'NumberOfStrips="1"', "Strips")
+    strips += array.format("connectivity", strip) + array.format("offsets", "6")
+    texts = {
+        "grid.vtk": head.format("UNSTRUCTURED_GRID") + f"CELLS 8 36\n{cells}CELL_TYPES 8\n3 9 9 9 9 9 5 5\n",
+        "strips.vtk": head.format("POLYDATA") + f"TRIANGLE_STRIPS 1 7\n6 {strip}\n",
+        "grid.vtu": grid + "</Cells></Piece></UnstructuredGrid></VTKFile>",
+        "strips.vtp": strips + "</Strips></Piece></PolyData></VTKFile>",
     }
+    return {name: text.encode() for name, text in texts.items()}
 
 
 def _vtp(packed: bool) -> bytes:
@@ -171,9 +207,40 @@ def _tables() -> dict[str, bytes]:
         "plain.asc": "// a comment\n" + _lines(rows),
         "weights.csv": "Points:0,Points:1,Points:2,weight\n" + _lines(np.insert(rows, 3, 1, axis=1)).replace(" ", ","),
     }
-    made = {name: text.encode() for name, text in texts.items()}
+    texts |= _digitised(rows)
+    made = {name: text.encode() for name, text in texts.items()} | _pcd(rows, unit)
     made["bare.npy"] = _npy(rows)
     return made | {"scan.npz": _npz(points=rows, normals=unit, weights=np.ones(12)), "points.mrk.json": _markups()}
+
+
+def _digitised(rows: np.ndarray) -> dict[str, str]:
+    """Points as scanners, digitisers, and programs of shapes and hearts write them."""
+    head = "//Position of fiducials X+, Y+, Y- on the subject\n%F\t0.1\t0\t0\n%F\t0\t0.08\t0\n%F\t0\t-0.08\t0\n"
+    guide = "".join(f"{x}\t{y}\t{z}\ta{i}\t{i % 3}\t1.0\t0\n" for i, (x, y, z) in enumerate(rows))
+    return {
+        "leica.pts": "12\n" + _lines(np.hstack([rows, np.abs(rows) * 50 // 1])),
+        "local.particles": _lines(rows),
+        "head.hsp": f"3\t200\n//Shape file\n{head}//No of rows, no of columns; position\n12\t3\n{_lines(rows)}",
+        "probe.elp": f"3\t2\n//Probe file\n1\n{head}%S\t4000\n%N\tRED\n0.1 0.2 0.3\n%N\tBLUE\n0.1 0.2 -0.3\n",
+        "head.pos": "12\n" + "".join(f"{i} {_lines([row])}" for i, row in enumerate(rows)) + "nasion 1 2 3\n",
+        "GPFile_000.txt": "x\ty\tz\tcontour type\tframeID\tweight\ttime frame\n" + guide,
+    }
+
+
+def _pcd(rows: np.ndarray, unit: np.ndarray) -> dict[str, bytes]:
+    """In the three forms, the packed one as runs of bytes and one run that came before."""
+    head = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z normal_x normal_y normal_z rgb\nSIZE 4 4 4 4 4 4 4\n"
+    head += "TYPE F F F F F F U\nCOUNT 1 1 1 1 1 1 1\nWIDTH 12\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 12\nDATA "
+    table = np.hstack([rows, unit, np.zeros((len(rows), 1))]).astype("<f4")
+    plain = np.ascontiguousarray(table.T[:6]).tobytes()
+    parts = [plain[i : i + 32] for i in range(0, len(plain), 32)]
+    packed = b"".join(bytes([len(part) - 1]) + part for part in parts)
+    packed += b"\x03\0\0\0\0" + b"\xe0\x23\x03"  # zeros, and 44 more as those four bytes before
+    return {
+        "text.pcd": (head + "ascii\n" + _lines(table)).encode(),
+        "binary.pcd": (head + "binary\n").encode() + table.tobytes(),
+        "packed.pcd": (head + "binary_compressed\n").encode() + struct.pack("<II", len(packed), table.nbytes) + packed,
+    }
 
 
 def _markups() -> bytes:
