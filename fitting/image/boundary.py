@@ -11,7 +11,7 @@ from jaxsubdiv.notices import warn
 from ..scan.scan import Scan, ScanError
 from .volume import Label, Volume, mask_of
 
-MOST_POINTS = 200_000
+MOST_POINTS = 400_000
 _MOST_FITTED, _POINTS_A_FACE, _LEAST_FACES, _MOST_FACES = 40_000, 40, 300, 2000
 # Standard deviation in voxels of the Gaussian that the indicator is smoothed with for its normals: less leaves
 # stairs, more rounds the shape off (4.1, 3.1 and 3.1 degrees at 1, 1.5 and 2 on a head in voxels of 1 mm).
@@ -54,7 +54,7 @@ def scan_of_label(volume: Volume, label: Label, *, most_points: int = MOST_POINT
         raise ScanError(f"no voxel has the label '{label}'.")
     low, cut = _cut_out(mask, volume)
     inside = mask[cut]
-    found = _drawn(_find_crossings(inside, 0.5), most_points)
+    found = _find_crossings(inside, 0.5)
     if not len(found.at):
         raise ScanError(f"the label '{label}' fills the image: it has no boundary in it.")
     slope = _slope(inside.astype(np.float32), found.at, _widths(volume))
@@ -62,7 +62,7 @@ def scan_of_label(volume: Volume, label: Label, *, most_points: int = MOST_POINT
     _tell_thin(inside, found, outward, volume, str(label))
     across = np.einsum("px,px->p", outward, _axes(volume)[found.axis])
     deviations = volume.spacing[found.axis] * np.sqrt((across**2 + _TURNED**2) / 12)
-    return _scan(volume, low, found, outward, deviations)
+    return _scan(volume, low, inside, found, outward, deviations, most_points)
 
 
 def suggest_settings(scan: Scan) -> dict[str, int]:
@@ -93,7 +93,7 @@ def scan_above(volume: Volume, threshold: float, *, most_points: int = MOST_POIN
         raise ScanError(f"{np.sum(~np.isfinite(values)):,} voxels of the image are not finite.")
     low, cut = _cut_out(values > threshold, volume)
     grey = values[cut].astype(np.float32)
-    found = _drawn(_find_crossings(grey, threshold), most_points)
+    found = _find_crossings(grey, threshold)
     if not len(found.at):
         raise ScanError(f"no surface at {threshold:g}: its voxels go from {values.min():g} to {values.max():g}.")
     slope = _slope(grey, found.at, _widths(volume) / 2)
@@ -101,21 +101,58 @@ def scan_above(volume: Volume, threshold: float, *, most_points: int = MOST_POIN
     least = 0.02 * volume.spacing.min()  # linear interpolation is no better
     noise = _noise(grey)
     deviations = np.clip(noise / np.maximum(size, 1e-30), least, volume.spacing.max())
-    return _scan(volume, low, found, _normals(slope, volume), deviations)
+    return _scan(volume, low, grey > threshold, found, _normals(slope, volume), deviations, most_points)
 
 
 def _scan(
     volume: Volume,
     low: Int[np.ndarray, "3"],
+    inside: Shaped[np.ndarray, "i j k"],
     found: _Crossings,
     outward: Float[np.ndarray, "p 3"],
     deviations: Float[np.ndarray, "p"],
+    most_points: int,
 ) -> Scan:
     """The scan of what was found in a part of the volume that begins at `low`."""
     last = np.array(volume.layers[0].shape) - 1
-    to_view = np.linalg.inv(volume.affine)
-    to_view[:3] /= np.maximum(last, 1)[:, None]
-    return Scan(volume.positions(found.at + low), outward, deviations=deviations, frame=volume.frame, view=to_view)
+    view = np.linalg.inv(volume.affine)
+    view[:3] /= np.maximum(last, 1)[:, None]
+    points = volume.positions(found.at + low)
+    if len(points) > most_points:
+        rows = np.sort(np.random.default_rng(0).choice(len(points), most_points, replace=False))
+        return Scan(points[rows], outward[rows], deviations=deviations[rows], frame=volume.frame, view=view)
+    faces = _outline(inside, found, outward, points)
+    of_all = {"faces": faces, "frame": volume.frame, "outlined": faces is not None, "view": view}
+    return Scan(points, outward, deviations=deviations, **of_all)
+
+
+def _outline(
+    inside: Shaped[np.ndarray, "i j k"],
+    found: _Crossings,
+    outward: Float[np.ndarray, "p 3"],
+    points: Float[np.ndarray, "p 3"],
+) -> Int[np.ndarray, "t 3"] | None:
+    """Triangles between the points, wound outwards, open where the image ends; None without the extra `mesh`.
+
+    Those of marching cubes on the inside, whose vertices are the middles of the very same pairs of voxels.
+    """
+    try:
+        import pyvista
+    except ImportError:
+        return None
+    grid = pyvista.ImageData(dimensions=inside.shape)
+    grid["inside"] = inside.astype(np.float32).ravel(order="F")
+    stairs = grid.contour([0.5], "inside", method="flying_edges")
+    own = np.floor(found.at).astype(np.int64) * 2
+    own[np.arange(len(own)), found.axis] += 1
+    halves = tuple(2 * np.array(inside.shape))
+    keys = np.ravel_multi_index(tuple(own.T), halves)
+    wanted = np.ravel_multi_index(tuple(np.round(2 * np.asarray(stairs.points)).astype(np.int64).T), halves)
+    order = np.argsort(keys)
+    faces = order[np.searchsorted(keys, wanted, sorter=order)][np.asarray(stairs.regular_faces)]
+    a, b, c = np.moveaxis(points[faces], 1, 0)
+    out = np.einsum("tx,tx->", np.cross(b - a, c - a), outward[faces].sum(axis=1))
+    return (faces if out > 0 else faces[:, ::-1]).astype(np.int32)
 
 
 def _widths(volume: Volume) -> Float[np.ndarray, "3"]:
@@ -150,13 +187,6 @@ def _find_crossings(values: Shaped[np.ndarray, "i j k"], threshold: float) -> _C
         indices.append(index)
         axes.append(np.full(len(index), axis))
     return _Crossings(np.concatenate(indices), np.concatenate(axes))
-
-
-def _drawn(found: _Crossings, n: int) -> _Crossings:
-    if len(found.at) <= n:
-        return found
-    rows = np.sort(np.random.default_rng(0).choice(len(found.at), n, replace=False))
-    return _Crossings(found.at[rows], found.axis[rows])
 
 
 def _slope(

@@ -85,6 +85,8 @@ class Scan(eqx.Module):
             does not keep them.
         frame: what the axes are, "RAS" (x to the right, y to the front, z up) or "LPS" (x to the left, y to the back, z
             up); None where that is not known. Nothing is turned by it: landmarks and results name it.
+        outlined: whether the faces are all of the surface that was seen, as the outline of a label is. A saved fit does
+            not keep it.
         view: of a scan that was seen in an image `[4, 4]`, takes positions to the unit cube that the image shows. A
             control mesh made from the scan ends there, as an open surface: what lies beyond was not seen. A saved fit
             does not keep it.
@@ -103,6 +105,7 @@ class Scan(eqx.Module):
     slices: Int[Array, "p"] | None = eqx.field(converter=_optional_whole, default=None)
     faces: Int[np.ndarray, "t 3"] | None = eqx.field(converter=_optional_faces, default=None)
     frame: Frame | None = eqx.field(static=True, default=None)
+    outlined: bool = eqx.field(static=True, default=False)
     view: Float[np.ndarray, "4 4"] | None = None
     regions: js.Regions | None = eqx.field(converter=_optional_regions, default=None)
 
@@ -168,7 +171,7 @@ class Scan(eqx.Module):
 
     def rows(self, chosen: Bool[np.ndarray, "p"] | Int[np.ndarray, "q"]) -> "Scan":
         """Some of the points, with all that is known of each."""
-        of_all = {"faces", "frame", "view", "regions"}
+        of_all = {"faces", "frame", "outlined", "view", "regions"}
         own = {name: value for name, value in vars(self).items() if name not in of_all and value is not None}
         faces = None
         if self.faces is not None:
@@ -199,8 +202,8 @@ def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[st
 
     Faces of a mesh file are kept, see `Scan.faces`. A column `slice` of a CSV file, or another table with a header row,
     numbers the slices, and `frameID` does so in guide points of biv-me (`GPFile_000.txt`). Points that are not finite
-    are dropped, with a warning; see `jaxsubdiv.read_points` for all that a file may hold. A column `label` or
-    `contour` names the regions, see `Scan.regions`.
+    are dropped, with a warning; see `jaxsubdiv.read_points` for all that a file may hold. The frame is what the file
+    says, see `jaxsubdiv.read_frame`. A column `label` or `contour` names the regions, see `Scan.regions`.
 
     Args:
         path: the file.
@@ -218,17 +221,19 @@ def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[st
     words = [labels] if isinstance(labels, str) else list(labels)
     of_rows = next((columns[name] for name in _LABELS if name in columns), [])
     if not words:
-        return _scan(path, *cloud, None, slices, _faces_between(path, cloud.points, scale), regions=of_rows or None)
+        faces = _faces_between(path, cloud.points, scale)
+        return _scan(path, *cloud, None, slices, faces, js.read_frame(path), regions=of_rows or None)
     chosen = np.array([any(word.casefold() in one.casefold() for word in words) for one in of_rows], bool)
     if not chosen.any():
         there = ", ".join(sorted(set(of_rows))) or "no column `label` or `contour`"
         wanted = " or ".join(f"'{word}'" for word in words)
         raise ScanError(f"{path.name}: no row has a label that holds {wanted}. It has: {there}.")
     kept = (None if rows is None else rows[chosen] for rows in (*cloud, None, slices))
-    return _scan(path, *kept, regions=[one for one, is_kept in zip(of_rows, chosen, strict=True) if is_kept])
+    own = [one for one, is_kept in zip(of_rows, chosen, strict=True) if is_kept]
+    return _scan(path, *kept, None, js.read_frame(path), regions=own)
 
 
-def _scan(path: Path, *parts: np.ndarray | None, regions: list[str] | None = None) -> Scan:
+def _scan(path: Path, *parts: np.ndarray | Frame | None, regions: list[str] | None = None) -> Scan:
     try:
         with np.errstate(over="ignore"):  # what passes single precision is not finite, and told as such
             return Scan(*parts, regions=regions)  # pyright: ignore[reportArgumentType]
