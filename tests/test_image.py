@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 import fitting
 import jaxsubdiv as js
 from fitting.__main__ import main as fit_command
+from fitting.image.volume import mask_of
 from jaxsubdiv.frames import in_frame
 
 SHAPE, SPACING = (9, 8, 7), np.array([0.5, 1.25, 3.0])
@@ -114,9 +115,12 @@ def test_a_nifti_file_in_metres_is_read_in_mm(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:The string")  # what highdicom thinks of the patient's name
-def test_a_dicom_segmentation(tmp_path):
-    mask = np.zeros((6, 20, 16, 2), np.uint8)
-    mask[2:4, 5:15, 4:12, 0], mask[3, 7, 3, 1] = 1, 1
+@pytest.mark.parametrize(("overlap", "kind"), [(False, "BINARY"), (True, "BINARY"), (False, "FRACTIONAL")])
+def test_a_dicom_segmentation(tmp_path, overlap, kind):
+    mask = np.zeros((6, 20, 16, 2), np.uint8 if kind == "BINARY" else np.float32)
+    mask[2:4, 5:15, 4:12, 0], mask[3, 7, 5 if overlap else 3, 1] = 1, 1
+    if kind == "FRACTIONAL":
+        mask[2, 0, 0, 0], mask[2, 0, 1, 0] = 0.2, 0.6
     segments = [
         highdicom.seg.SegmentDescription(
             n, name, codes.SCT.Organ, codes.SCT.Liver, highdicom.seg.SegmentAlgorithmTypeValues.MANUAL
@@ -125,16 +129,20 @@ def test_a_dicom_segmentation(tmp_path):
     ]
     uid = pydicom.uid.generate_uid
     made = highdicom.seg.Segmentation(
-        dicom_slices(6, 20, 16), mask, "BINARY", segments, uid(), 1, uid(), 1, "maker", "model", "1", "0"
+        dicom_slices(6, 20, 16), mask, kind, segments, uid(), 1, uid(), 1, "maker", "model", "1", "0"
     )
     made.save_as(tmp_path / "a.dcm")
 
     volume = fitting.read_volume(tmp_path / "a.dcm")
 
     assert volume.frame == "LPS"
-    assert [(one.label.name, one.voxels) for one in fitting.find_labels(volume)] == [("liver", 160), ("vessel", 1)]
-    index = np.argwhere(volume.layers[1]).astype(float)
-    np.testing.assert_allclose(volume.positions(index), [[10 + 3 * 1.5, -20 + 7 * 2.0, 30 + 3 * 3.0]])
+    assert len(volume.layers) == (1 if kind == "BINARY" and not overlap else 2)
+    assert all(layer.itemsize == 1 for layer in volume.layers)
+    liver = 160 + (kind == "FRACTIONAL")
+    assert [(one.label.name, one.voxels) for one in fitting.find_labels(volume)] == [("liver", liver), ("vessel", 1)]
+    index = np.argwhere(mask_of(volume, fitting.choose_label(volume, "vessel"))).astype(float)
+    column = 5 if overlap else 3
+    np.testing.assert_allclose(volume.positions(index), [[10 + column * 1.5, -20 + 7 * 2.0, 30 + 3 * 3.0]])
     assert volume.layers[0].shape == (4, 20, 16)  # empty slices are not stored
 
 
@@ -352,7 +360,7 @@ def test_the_command_fits_every_label_into_a_folder_of_its_own(two_labels, tmp_p
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ([], r"seg.nii.gz: it has 2 labels; choose by --label .* 1 \(.* ml\), 5 right/kidney \(.* ml\)"),
+        ([], r"seg.nii.gz: it has 2 labels; choose one by --label .* 1 \(.* ml\), 5 right/kidney \(.* ml\)"),
         (["--label", "liver"], "no voxel has the label 'liver'"),
         (["--label", "1", "--above", "3"], "not both"),
         (["--labels", "liver"], "is for tables"),
@@ -376,14 +384,14 @@ def damaged(path: Path, head: bytes) -> None:
     path.write_bytes(gzip.compress(head) if path.suffix == ".gz" else head)
 
 
-NIFTI = struct.pack("<i36x8h14xhh36xf", 348, 3, 2000, 2000, 2000, 1, 1, 1, 1, 2, 8, 352.0).ljust(352, b"\0")
+NIFTI = struct.pack("<i36x8h14xhh36xf", 348, 3, 2000, 2000, 2000, 1, 1, 1, 1, 2, 8, 352.0).ljust(344, b"\0") + b"n+1\0"
 
 
 @pytest.mark.parametrize(
     ("name", "content", "text"),
     [
         ("a.nii", b"not an image at all", "does not begin as a NIfTI"),
-        ("a.nii", NIFTI, "8,000,000,000 bytes of voxels, and the file has 352"),
+        ("a.nii", NIFTI, "8,000,000,000 bytes of voxels, and the file has 348"),
         ("a.nii.gz", NIFTI, "8,000,000,000 bytes of voxels, and"),
         ("a.nii.gz", b"\x1f\x8b\x08garbage", "does not begin|damaged"),
         ("a.nrrd", b"NRRD0004\ntype: short\ndimension: 3\n", "does not begin as a NRRD"),

@@ -18,6 +18,8 @@ _MOST_FITTED, _POINTS_A_FACE, _LEAST_FACES, _MOST_FACES = 40_000, 40, 300, 2000
 _SMOOTHING = 1.5
 _REACH = 4  # standard deviations until the Gaussian is cut
 _TURNED = 0.1  # the normals' own error, in radians: no point is surer than it says
+_MOST_GREY = 1e30
+_SLABS = 8  # of an image, of which the noise is estimated
 _THIN, _MANY_THIN = 2.0, 0.02  # voxels; share of the boundary
 
 
@@ -88,9 +90,12 @@ def scan_above(volume: Volume, threshold: float, *, most_points: int = MOST_POIN
     Raises:
         ScanError: no value, or every value, is above; a value is not finite.
     """
+    if len(volume.layers) > 1:
+        raise ScanError(f"it has {len(volume.layers)} layers, and an image has one. Are they segments? Give a label.")
     values = volume.layers[0]
-    if not np.isfinite(values).all():
-        raise ScanError(f"{np.sum(~np.isfinite(values)):,} voxels of the image are not finite.")
+    if not (values.min() > -_MOST_GREY and values.max() < _MOST_GREY):  # also of NaN
+        wrong = np.sum(~(np.abs(values) < _MOST_GREY))
+        raise ScanError(f"{wrong:,} voxels of the image are not finite, or far too large.")
     low, cut = _cut_out(values > threshold, volume)
     grey = values[cut].astype(np.float32)
     found = _drawn(_find_crossings(grey, threshold), most_points)
@@ -180,7 +185,7 @@ def _normals(slope: Float[np.ndarray, "p 3"], volume: Volume) -> Float[np.ndarra
     """Outward unit normals, zero where the smoothed values are flat."""
     down = -_to_mm(slope, volume)
     length = np.linalg.norm(down, axis=1, keepdims=True)
-    return np.divide(down, length, out=np.zeros_like(down), where=length > 1e-9)
+    return np.divide(down, length, out=np.zeros_like(down), where=length > 1e-6 * length.max(initial=0.0))
 
 
 def _axes(volume: Volume) -> Float[np.ndarray, "3 3"]:
@@ -190,7 +195,8 @@ def _axes(volume: Volume) -> Float[np.ndarray, "3 3"]:
 
 def _noise(values: Float[np.ndarray, "i j k"]) -> float:
     """Standard deviation of the noise of an image, from second differences, which smooth values have hardly any of."""
-    of_axes = [np.diff(values, 2, axis=axis).ravel() for axis in range(3) if values.shape[axis] > 2]
+    some = [slab[:, :, :3] for slab in np.array_split(values, _SLABS, axis=2) if slab.size]
+    of_axes = [np.diff(slab, 2, axis=axis).ravel() for slab in some for axis in range(3) if slab.shape[axis] > 2]
     second = np.concatenate([rows[rows != 0] for rows in of_axes]) if of_axes else np.zeros(0)
     return float(np.median(np.abs(second)) * 1.4826 / np.sqrt(6)) if len(second) else 0.0
 
