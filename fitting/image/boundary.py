@@ -56,7 +56,7 @@ def scan_of_label(volume: Volume, label: Label, *, most_points: int = MOST_POINT
         raise ScanError(f"no voxel has the label '{label}'.")
     low, cut = _cut_out(mask, volume)
     inside = mask[cut]
-    found = _drawn(_find_crossings(inside, 0.5), most_points)
+    found = _find_crossings(inside, 0.5, most_points)
     if not len(found.at):
         raise ScanError(f"the label '{label}' fills the image: it has no boundary in it.")
     slope = _slope(inside.astype(np.float32), found.at, _widths(volume))
@@ -98,7 +98,7 @@ def scan_above(volume: Volume, threshold: float, *, most_points: int = MOST_POIN
         raise ScanError(f"{wrong:,} voxels of the image are not finite, or far too large.")
     low, cut = _cut_out(values > threshold, volume)
     grey = values[cut].astype(np.float32)
-    found = _drawn(_find_crossings(grey, threshold), most_points)
+    found = _find_crossings(grey, threshold, most_points)
     if not len(found.at):
         raise ScanError(f"no surface at {threshold:g}: its voxels go from {values.min():g} to {values.max():g}.")
     slope = _slope(grey, found.at, _widths(volume) / 2)
@@ -141,27 +141,27 @@ def _cut_out(
     return np.array([one.start for one in box]), (box[0], box[1], box[2])
 
 
-def _find_crossings(values: Shaped[np.ndarray, "i j k"], threshold: float) -> _Crossings:
+def _find_crossings(values: Shaped[np.ndarray, "i j k"], threshold: float, most: int) -> _Crossings:
+    """All of them, or an even part where there are more: of noise there may be more than voxels."""
     above = values > threshold
+    pairs = [
+        tuple(tuple(slice(*ends) if n == axis else slice(None) for n in range(3)) for ends in ((None, -1), (1, None)))
+        for axis in range(3)
+    ]
+    changes = [above[first] != above[second] for first, second in pairs]
+    counts = [int(np.count_nonzero(change)) for change in changes]
+    n = sum(counts)
+    rows = np.arange(n) if n <= most else np.sort(np.random.default_rng(0).choice(n, most, replace=False))
     indices, axes = [], []
-    for axis in range(3):
-        first, second = (
-            tuple(slice(*ends) if n == axis else slice(None) for n in range(3)) for ends in ((None, -1), (1, None))
-        )
-        here = np.nonzero(above[first] != above[second])
+    for axis, ((first, second), change) in enumerate(zip(pairs, changes, strict=True)):
+        own = rows[(rows >= sum(counts[:axis])) & (rows < sum(counts[: axis + 1]))] - sum(counts[:axis])
+        here = np.unravel_index(np.flatnonzero(change)[own], change.shape)
         a, b = (values[part][here].astype(np.float64) for part in (first, second))
         index = np.stack(here, axis=1).astype(np.float64)
         index[:, axis] += (threshold - a) / (b - a)
         indices.append(index)
         axes.append(np.full(len(index), axis))
     return _Crossings(np.concatenate(indices), np.concatenate(axes))
-
-
-def _drawn(found: _Crossings, n: int) -> _Crossings:
-    if len(found.at) <= n:
-        return found
-    rows = np.sort(np.random.default_rng(0).choice(len(found.at), n, replace=False))
-    return _Crossings(found.at[rows], found.axis[rows])
 
 
 def _slope(
