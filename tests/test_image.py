@@ -319,6 +319,25 @@ def test_slices_show_the_label_where_it_is_and_name_their_sides(frame):
         assert top in "SA" and left in "RAI"
 
 
+def test_every_axis_has_sides_of_its_own():
+    affine = np.eye(4)
+    affine[:3, :3] = Rotation.from_euler("z", 45, degrees=True).as_matrix()
+    affine[:2, :2] += [[0.01, 0], [0, -0.01]]  # both axes are nearer to x
+    volume = fitting.Volume((np.ones((9, 9, 9), np.uint8),), affine, "RAS")
+    corners = volume.positions(np.array([[2.0, 2, 2], [6, 6, 6]]))
+    for one in fitting.cut_slices(volume, corners, label=fitting.Label(1, "")):
+        assert len(set(one.sides)) == 4
+
+
+def test_an_even_part_of_many_points_is_drawn():
+    volume, _ = ellipsoid(2.0)
+    whole = np.asarray(fitting.scan_of_label(volume, fitting.Label(1, "")).points)
+    part = np.asarray(fitting.scan_of_label(volume, fitting.Label(1, ""), most_points=500).points)
+    assert len(part) == 500 and len(np.unique(part, axis=0)) == 500
+    assert (np.abs(whole[None] - part[:, None]).max(axis=-1).min(axis=1) < 1e-6).all()
+    np.testing.assert_allclose(part.mean(axis=0), whole.mean(axis=0), atol=2)
+
+
 def test_contours_lie_on_the_surface():
     volume, _ = ellipsoid(2.0)
     mesh = fitting.control_mesh(fitting.scan_of_label(volume, fitting.Label(1, "")), faces=100)
@@ -357,6 +376,12 @@ def test_the_command_fits_every_label_into_a_folder_of_its_own(two_labels, tmp_p
     assert loaded.scan.frame == "RAS"
     assert "seg.nii.gz, 5 right/kidney" in (tmp_path / "out" / "summary.csv").read_text()
     capsys.readouterr()
+
+
+def test_labels_and_grey_values_at_once_are_refused_before_any_fit(two_labels, tmp_path, capsys):
+    options = ["--label", "all", "--above", "3", "-o", str(tmp_path / "out")]
+    assert fit_command([str(two_labels), *options]) == 2
+    assert "not both" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -541,15 +566,15 @@ def test_names_are_printable(tmp_path):
     header = {
         "space": "LPS",
         "space directions": np.eye(3),
-        "Segment0_Name": "K\u00f6pfchen",
+        "Segment0_Name": "K-pfchen",
         "Segment1_Name": "a\x1b[31m",
     }
     path = tmp_path / "a.seg.nrrd"
     nrrd.write(str(path), np.ones(SHAPE, np.uint8), header)
     head, voxels = path.read_bytes().split(b"\n\n", 1)
-    path.write_bytes(re.sub(rb"K.*pfchen", "K\u00f6pfchen".encode(), head) + b"\n\n" + voxels)
+    path.write_bytes(re.sub(rb"K.*pfchen", "Köpfchen".encode(), head) + b"\n\n" + voxels)
     names = [label.name for label in fitting.read_volume(path).labels]
-    assert names[0] == "K\u00f6pfchen" and names[1] == "a [31m"
+    assert names[0] == "Köpfchen" and names[1] == "a [31m"
 
 
 @pytest.mark.parametrize("encoding", ["raw", "gzip", "bzip2", "ascii"])

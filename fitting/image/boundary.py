@@ -90,9 +90,9 @@ def scan_above(volume: Volume, threshold: float, *, most_points: int = MOST_POIN
     Raises:
         ScanError: no value, or every value, is above; a value is not finite.
     """
-    if len(volume.layers) > 1:
+    values, *others = volume.layers
+    if others:
         raise ScanError(f"it has {len(volume.layers)} layers, and an image has one. Are they segments? Give a label.")
-    values = volume.layers[0]
     if not (values.min() > -_MOST_GREY and values.max() < _MOST_GREY):  # also of NaN
         wrong = np.sum(~(np.abs(values) < _MOST_GREY))
         raise ScanError(f"{wrong:,} voxels of the image are not finite, or far too large.")
