@@ -37,6 +37,8 @@ from .report.refit import Refit as Refit
 from .report.report import Report as Report
 from .report.report import WorstPlace as WorstPlace
 from .report.result import FitResult as FitResult
+from .run.carry import CarriedLandmarks as CarriedLandmarks
+from .run.carry import carry_landmarks as carry_landmarks
 from .run.cohort import fit_cohort as fit_cohort
 from .run.fit import Sweep as Sweep
 from .run.fit_scan import ScanFit as ScanFit
@@ -51,6 +53,7 @@ from .scan.example import example as example
 from .scan.landmarks import Landmarks as Landmarks
 from .scan.landmarks import match_landmarks as match_landmarks
 from .scan.landmarks import read_landmarks as read_landmarks
+from .scan.landmarks import write_landmarks as write_landmarks
 from .scan.scan import Scan as Scan
 from .scan.scan import ScanError as ScanError
 from .scan.search_closest import search_closest as search_closest

@@ -22,6 +22,7 @@ import jaxsubdiv as js
 from jaxsubdiv import SCHEMES
 from jaxsubdiv.console import in_colour, lasting_streams, plain_warnings, printable
 from jaxsubdiv.files import replacing
+from jaxsubdiv.frames import Frame, in_frame
 
 from .image.boundary import suggest_settings
 from .image.read import Seen, is_image, read_labels, read_scan, read_seen, stem
@@ -33,15 +34,23 @@ from .report.page import write_page
 from .report.picture import draw_fit
 from .report.result import FitResult
 from .report.saved import read_marks, save_fit
+from .run.carry import carry_landmarks
 from .run.checkpoint import differing, marks_of
 from .run.fit import Sweep
 from .run.fit_scan import ScanFit, misfit
-from .run.folder import FIT, SUMMARY, filling, is_unfinished, working_in
+from .run.folder import CARRIED, FIT, LANDMARKS, SUMMARY, filling, is_unfinished, working_in
 from .run.names import find_scans, name_folder, name_folders
 from .run.recipe import Recipe, load, load_recipe
 from .run.surface_files import FORMATS, check_formats, write_surface
 from .scan.example import Example, example
-from .scan.landmarks import Landmarks, match_landmarks, read_landmarks
+from .scan.landmarks import (
+    FramedLandmarks,
+    Landmarks,
+    match_landmarks,
+    read_framed_landmarks,
+    read_landmarks,
+    write_landmarks,
+)
 from .scan.scan import Scan
 from .start.parts import PartKind
 
@@ -93,6 +102,8 @@ class _Job(NamedTuple):
     landmarks: Landmarks | None
     boundary: BoundaryCurve | None = None
     seen: Seen | None = None
+    carried: FramedLandmarks | None = None
+    """Places on the control mesh, to be carried to the fit."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -108,6 +119,8 @@ def _main(arguments: Sequence[str] | None) -> int:
         parser.error("a control mesh needs a scan to be fitted to: give SCAN to --control")
     if options.labels and not options.scans:
         parser.error("labels are those of a scan: give SCAN before --labels, which takes all the words that follow")
+    if options.carry and not options.control:
+        parser.error("--carry takes landmarks of a template to the scan: give the template, --control MESH")
     _keep_what_serves_again()
     try:
         _check_options(options)
@@ -149,6 +162,13 @@ def _check_options(options: argparse.Namespace) -> None:
     names |= {name: name for name in ("scale", "control_scale")}
     typed = {name: f"--{option.replace('_', '-')}" for name, option in names.items()}
     check_numbers({name: getattr(options, option) for name, option in names.items()}, typed)
+    if options.carry and os.path.abspath(options.carry) in _landmark_files(options):
+        raise ValueError(f"--carry {options.carry} would be replaced by the landmarks of the fit: give another -o OUT.")
+
+
+def _landmark_files(options: argparse.Namespace) -> list[str]:
+    """Where the named output folder gets landmarks."""
+    return [os.path.abspath(Path(options.output or "fits") / name) for name in (LANDMARKS, CARRIED)]
 
 
 def _recipe(options: argparse.Namespace) -> Recipe:
@@ -178,17 +198,21 @@ def _run_all(scans: list[_Source], options: argparse.Namespace, recipe: Recipe) 
     counts = Counter(scan.title() for scan in scans)
     titles = [scan.title(whole=counts[scan.title()] > 1) for scan in scans]
     folders = name_folders([scan.as_file for scan in scans])
-    rows, summary = [], ""
+    rows, summary, landmarks = [], "", []
     try:
         with working_in(parent):
             for number, (scan, title, name) in enumerate(zip(scans, titles, folders, strict=True), 1):
                 print(f"\n[{number}/{len(scans)}] {scan.title(whole=True)}")
                 rows.append(_run(scan, parent / name, options, recipe, title))
-                summary = _as_csv(rows)
-                _write_summary(parent / SUMMARY, summary)  # after every scan: the run may be stopped
+                summary = _as_csv(rows, _SUMMARY)
+                _write_table(parent / SUMMARY, summary)  # after every scan: the run may be stopped
+                if options.carry and rows[-1]["status"] < 2:
+                    landmarks += _landmark_rows(parent / name / CARRIED, title)
+                    columns = dict.fromkeys(column for row in landmarks for column in row)
+                    _write_table(parent / CARRIED, _as_csv(landmarks, tuple(columns)))
     except (ValueError, OSError) as error:
         return _fail(error)
-    print(f"\n{summary}\nwrote    {parent / SUMMARY}")
+    print(f"\n{summary}\nwrote    {parent / SUMMARY}{f' and {CARRIED}' if landmarks else ''}")
     failed = [row["scan"] for row in rows if row["status"]]
     if failed:
         print(f"{len(failed)} of {len(rows)} did not end well: {', '.join(failed)}", file=sys.stderr)
@@ -201,19 +225,25 @@ def _fail(error: BaseException) -> int:
     return 2
 
 
-def _as_csv(rows: list[dict]) -> str:
+def _as_csv(rows: list[dict], columns: Sequence[str]) -> str:
     table = io.StringIO()
-    writer = csv.DictWriter(table, _SUMMARY, restval="", lineterminator="\n")
+    writer = csv.DictWriter(table, columns, restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return table.getvalue()
 
 
-def _write_summary(path: Path, summary: str) -> None:
+def _landmark_rows(path: Path, title: str) -> list[dict]:
+    """The landmarks of one scan, as its folder has them."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return [{"scan": title} | row for row in csv.DictReader(file)]
+
+
+def _write_table(path: Path, text: str) -> None:
     """Tell where that fails, and go on: the fits of the next scans do not depend on it."""
     try:
         with replacing(path) as unfinished:
-            unfinished.write_text(summary, encoding="utf-8")
+            unfinished.write_text(text, encoding="utf-8")
     except OSError as error:
         _fail(error)
 
@@ -234,7 +264,7 @@ def _run(scan: _Source | None, folder: Path, options: argparse.Namespace, recipe
 
 def _fit(scan: _Source | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str) -> dict:
     began = time.perf_counter()
-    job = _inputs(scan, options)
+    job = _inputs(scan, options, recipe)
     slices = "" if job.scan.slices is None else f" in {len(np.unique(job.scan.slices))} slices"
     print(f"scan     {job.scan.n_points:,} points{slices}, {_size(np.asarray(job.scan.points))}")
     if job.seen is not None:
@@ -262,7 +292,7 @@ def _fit(scan: _Source | None, folder: Path, options: argparse.Namespace, recipe
     seconds = time.perf_counter() - began
     report, off = found.result.report(uncertainty=True), misfit(found.result)
     print(f"done     in {seconds:.1f} s{_ending(found, off)}\n\n{dataclasses.replace(report, warnings=[])}\n")
-    _save(folder, found, title, marks, _slices_of(job, found.result), options)
+    _save(folder, found, title, marks, job, options)
     _print_warnings(found.result)
     return _row(title, found.result, off, seconds)
 
@@ -300,6 +330,7 @@ def _marks(job: _Job, recipe: Recipe, options: argparse.Namespace) -> dict[str, 
     inputs = {f"{name} of the scan": value for name, value in vars(job.scan).items()}
     inputs["control mesh"] = None if job.mesh is None else (job.mesh.vertices, job.mesh.faces, job.mesh.normals)
     inputs |= {"landmarks": job.landmarks, "boundary": job.boundary}
+    inputs |= {} if job.carried is None else {"carried landmarks": job.carried}
     if (options.surface, options.surface_level) != (["ply"], None):
         inputs["surface format or level"] = options.surface, options.surface_level
     return marks_of(inputs | {field.name: getattr(recipe, field.name) for field in dataclasses.fields(recipe)})
@@ -333,7 +364,7 @@ def _with_suggested(recipe: Recipe, scan: Scan, options: argparse.Namespace) -> 
     )
 
 
-def _inputs(scan: _Source | None, options: argparse.Namespace) -> _Job:
+def _inputs(scan: _Source | None, options: argparse.Namespace, recipe: Recipe) -> _Job:
     if scan is None:
         print(
             f"example  {options.example}, its control vertices moved by noise of {_EXAMPLE_NOISE:g} mm in each "
@@ -348,8 +379,8 @@ def _inputs(scan: _Source | None, options: argparse.Namespace) -> _Job:
         points = seen.scan
     else:
         points = read_scan(file, scale=options.scale, labels=options.labels, label=options.label, above=options.above)
-    mesh = None if options.control is None else js.read_mesh(options.control, scale=options.control_scale)
-    landmarks = None
+    mesh, of_mesh = _template(options, recipe, points.frame)
+    landmarks = carried = None
     if (options.landmarks is None) != (options.control_landmarks is None) or (options.landmarks and mesh is None):
         raise ValueError(
             "landmarks are places on both sides: give --landmarks FILE for the scan, --control-landmarks FILE for the "
@@ -357,9 +388,11 @@ def _inputs(scan: _Source | None, options: argparse.Namespace) -> _Job:
         )
     if options.landmarks is not None:
         landmarks = match_landmarks(
-            read_landmarks(options.landmarks, scale=options.scale),
-            read_landmarks(options.control_landmarks, scale=options.control_scale),
+            read_landmarks(options.landmarks, scale=options.scale, frame=points.frame),
+            read_landmarks(options.control_landmarks, scale=options.control_scale, frame=of_mesh),
         )
+    if options.carry is not None:
+        carried = read_framed_landmarks(options.carry, scale=options.control_scale, frame=of_mesh)
     if mesh is None and (options.symmetry is not None or options.likeness is not None):
         which = "symmetry" if options.symmetry is not None else "likeness"
         raise ValueError(f"{which} is that of a template: give --control MESH to --{which}.")
@@ -368,7 +401,23 @@ def _inputs(scan: _Source | None, options: argparse.Namespace) -> _Job:
         boundary = BoundaryCurve(boundary_of(js.read_mesh(file, scale=options.scale, check=False)))
     elif options.boundary is not None:
         boundary = BoundaryCurve(js.read_points(options.boundary, scale=options.scale).points)
-    return _Job(scan.title(), points, mesh, landmarks, boundary, seen)
+    return _Job(scan.title(), points, mesh, landmarks, boundary, seen, carried)
+
+
+def _template(
+    options: argparse.Namespace, recipe: Recipe, of_scan: Frame | None
+) -> tuple[js.ControlMesh | None, Frame | None]:
+    """The template in the frame of the scan where both files say theirs, and the frame that it is in."""
+    if options.control is None:
+        return None, None
+    mesh, own = js.read_mesh(options.control, scale=options.control_scale), js.read_frame(options.control)
+    if own is None:  # a template that stays where it is lies in the frame of the scan
+        return mesh, of_scan if recipe.pose is None else None
+    if of_scan is None or own == of_scan:
+        return mesh, own
+    print(f"note     the control mesh was turned from {own}, as its file says, to the scan's {of_scan}")
+    normals = None if mesh.normals is None else in_frame(mesh.normals, own, of_scan)
+    return js.ControlMesh(in_frame(mesh.vertices, own, of_scan), mesh.faces, normals), of_scan
 
 
 def _ending(found: ScanFit, off: float) -> str:
@@ -378,19 +427,20 @@ def _ending(found: ScanFit, off: float) -> str:
 
 
 def _save(
-    folder: Path,
-    found: ScanFit,
-    title: str,
-    marks: dict[str, str],
-    slices: Sequence[Slice],
-    options: argparse.Namespace,
+    folder: Path, found: ScanFit, title: str, marks: dict[str, str], job: _Job, options: argparse.Namespace
 ) -> None:
     """The fit as files, all of them in place of those of an earlier one, or none."""
-    result = found.result
+    result, frame = found.result, job.scan.frame or (job.carried.frame if job.carried is not None else None)
+    slices = _slices_of(job, result)
     with filling(folder) as new:
-        js.write_mesh(new / "control.obj", result.control_mesh)
-        written = ["control.obj", *_write_surface(new, result, options)]
+        js.write_mesh(new / "control.obj", result.control_mesh, frame=frame)
+        written = ["control.obj", *_write_surface(new, result, options, frame)]
         written += ["report.json", "fit.html", "fit.npz", "recipe.json"]
+        if job.carried is not None and job.mesh is not None:
+            there = carry_landmarks(job.mesh, result, job.carried.positions)
+            for name in (LANDMARKS, CARRIED):
+                write_landmarks(new / name, there.positions, frame=frame, deviations=there.deviations)
+                written.append(name)
         (new / "report.json").write_text(result.report(uncertainty=True).as_json() + "\n", encoding="utf-8")
         write_page(new / "fit.html", result, title=title, start=found.start, slices=slices)
         assert result.recipe is not None
@@ -403,10 +453,10 @@ def _save(
     print(f"wrote    {', '.join(written)} in {folder}")
 
 
-def _write_surface(folder: Path, result: FitResult, options: argparse.Namespace) -> list[str]:
+def _write_surface(folder: Path, result: FitResult, options: argparse.Namespace, frame: Frame | None) -> list[str]:
     """The surface's files; where it has no such level, told, none: the fit itself is not lost."""
     try:
-        return write_surface(folder, result.at_level(options.surface_level), options.surface)
+        return write_surface(folder, result.at_level(options.surface_level), options.surface, frame)
     except (ValueError, MemoryError) as error:
         print(f"note     no surface: {str(error) or 'it takes more memory than there is'}")
         return []
@@ -487,13 +537,14 @@ def _parser() -> argparse.ArgumentParser:
         "SCAN it runs an example that ships with the package.",
         epilog="OUT gets control.obj (fitted control mesh with normals), surface.ply (refined surface, with the signed "
         "distance of the scan and the standard deviation of the surface in mm at every vertex, as in .glb, .vtp and "
-        ".shape.gii), report.json, fit.html "
-        "(a page to turn the surface in, without a network), fit.png, and fit.npz and recipe.json for `fitting.load`; "
-        "of several scans, a folder each, named by the scan, and where names are alike by its folders too, and "
-        "summary.csv. Files take their places together when a fit has ended; until then checkpoints mark OUT as "
+        ".shape.gii), report.json, fit.html (a page to turn the surface in, without a network), fit.png, and fit.npz "
+        "and recipe.json for `fitting.load`; with --carry landmarks.mrk.json and landmarks.csv; of several scans, a "
+        "folder each, named by the scan, and where names are alike by its folders too, and summary.csv, and "
+        "landmarks.csv with all landmarks. Files take their places together when a fit has ended; until then "
+        "checkpoints mark OUT as "
         "unfinished. Lengths are in mm. A fit that was stopped, by Ctrl-C or otherwise, goes on from the last sweep "
-        "when the same command is given again. Exit status: 0 the fit converged and nothing speaks against it, 1 it is "
-        "not to be trusted (the warnings say why; files are written all the same), 2 an input cannot be used, 130 "
+        "when the same command is given again. Exit status: 0 the fit converged and nothing speaks against it, 1 it "
+        "is not to be trusted (the warnings say why; files are written all the same), 2 an input cannot be used, 130 "
         "stopped by Ctrl-C.",
     )
     add = parser.add_argument
@@ -511,8 +562,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--part", choices=get_args(PartKind), help="of a scan that shows several; default: the largest, with a warning")
     add("--mirror", action="store_true", help="fit the template's mirror image: that of the other side of the body")
     add("--align", choices=("similarity", "rigid", "affine", "none"), help=f"of the template (default: {Recipe.pose})")
-    add("--landmarks", metavar="FILE", help="named places on the scan, .json or .csv; the template's in the next")
+    add("--landmarks", metavar="FILE", help="named places on the scan: .mrk.json .json .csv .tsv .fcsv")
     add("--control-landmarks", metavar="FILE", help="the same names on the template")
+    add(
+        "--carry",
+        metavar="FILE",
+        help="landmarks on the template, put onto the fitted surface: landmarks.mrk.json and landmarks.csv in OUT",
+    )
     add("--symmetry", type=float, metavar="MM", help="keep the fit as symmetric as the template, but for so much")
     add(
         "--likeness",

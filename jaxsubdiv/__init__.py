@@ -19,6 +19,7 @@ from ._evaluate import SurfaceJet as SurfaceJet
 from ._evaluate import evaluate_control as evaluate_control
 from ._io import PointCloud as PointCloud
 from ._io import check_can_write as check_can_write
+from ._io import read_frame as read_frame
 from ._io import read_labelled_points as read_labelled_points
 from ._io import read_mesh as read_mesh
 from ._io import read_points as read_points

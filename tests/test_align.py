@@ -289,7 +289,7 @@ BAD_FILES = {
     "d.csv": ("lpa,1,2,3\nrpa,1,x,3\n", r"d\.csv, line 2: 'x' is not a number"),
     "e.csv": ("lpa,1,2,3\nlpa,1,2,3\n", r"e\.csv, line 2: a landmark of the name 'lpa' came before"),
     "f.csv": ("name,x,y,z\n", r"f\.csv holds no landmarks"),
-    "g.txt": ("lpa 1 2 3", r"landmarks are read from \.json, \.csv and \.fcsv files, not from \.txt"),
+    "g.txt": ("lpa 1 2 3", r"landmarks are read from \.json, \.csv, \.tsv and \.fcsv files, not from \.txt"),
 }
 
 

@@ -103,6 +103,16 @@ class Posterior:
                 variances[some] = np.einsum("vd,vde,ve->v", by, blocks[face[some] - first], by, optimize=True)
         return np.maximum(variances, 0)
 
+    def covariances(self, at: js.SurfacePoint) -> Float[np.ndarray, "p 3 3"]:
+        """Of places that move along with the surface, in mm^2, without the misfit."""
+        structure, by_surface = self.equations.structure, np.asarray(self.equations.found.by_surface)
+        face = np.asarray(at.face)
+        owner, slots = structure.patches.owner[face], structure.patches.slots[face]
+        _, weights = js.corner_weights(self.fit.surface(), at)
+        by = np.einsum("pc,pcdx->pdx", np.asarray(weights, np.float64), by_surface[owner[:, None], slots])
+        blocks = self.factor.covariance_blocks(self._free_columns(structure.elements.columns[owner]))
+        return np.einsum("pdx,pde,pey->pxy", by, blocks, by, optimize=True)
+
     def _control_variances(self) -> Float[np.ndarray, "v"]:
         """Of every control vertex along its normal."""
         layout, normals = self.fit.model.layout, np.asarray(unit(self.fit.y.control.normals), np.float64)

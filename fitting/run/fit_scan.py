@@ -175,9 +175,7 @@ def fit_scan(
         topology = js.build_topology(bare, start.scheme, levels, **of_tables)
         memory = memory_of_fit(topology, scan.n_points) / 1e9
         say(f"fits {len(start.mesh.vertices):,} control vertices, in about {memory:.1f} GB of memory")
-        control = start.mesh.control(weights=first.weights)
-        if start.splits == 0 and not first.interpolates:
-            control = js.Control(_swollen(start.mesh, first), control.normals)
+        control = start.mesh.control(weights=first.weights) if start.splits else first_control(start.mesh, first)
         if kept is not None:
             check(start.scheme, topology, control, scan)  # what cannot be fitted leaves no file
             kept.write(_arrays(start))
@@ -199,7 +197,7 @@ def fit_scan(
         outcome = _outcome(result, start.mesh, tolerance_mm, most_faces)
         if tolerance_mm is None or outcome is not None:
             break
-        finer = _split(result.scheme, start.mesh, result.control)
+        finer = split(result.scheme, start.mesh, result.control)
         unseen = np.zeros(finer.n_faces, bool)
         if js.splits_in_four(result.scheme, topology):
             unseen = np.repeat(~_has_points(result), 4)
@@ -226,7 +224,7 @@ def _has_points(result: FitResult) -> Bool[np.ndarray, "f"]:
 def _partners(template: js.ControlMesh, scheme: js.AbstractScheme, splits: int) -> Symmetry:
     """On the template as it is given: an affine pose leaves no mirror plane, and a fit no exact one."""
     for _ in range(splits):
-        template = _split(scheme, template, template.control(weights=scheme.weights))
+        template = split(scheme, template, template.control(weights=scheme.weights))
     return find_symmetry(template)
 
 
@@ -290,13 +288,19 @@ def _outcome(result: FitResult, mesh: js.ControlMesh, tolerance_mm: float | None
     return "no more faces" if too_many else None
 
 
-def _split(scheme: js.AbstractScheme, mesh: js.ControlMesh, control: js.Control) -> js.ControlMesh:
+def split(scheme: js.AbstractScheme, mesh: js.ControlMesh, control: js.Control) -> js.ControlMesh:
     """A control mesh of these faces, each cut in four by the scheme's rule: the same surface, with more to move."""
     if scheme.h is not None and scheme.h.ndim:  # one h a level: what is left of it serves the split mesh
         scheme = dataclasses.replace(scheme, h=scheme.h[:1])
     bare = js.ControlMesh(control.vertices, mesh.faces, check=False)
     finer = js.refine(scheme, js.build_topology(bare, scheme, 1), control)
     return js.ControlMesh(finer.vertices, finer.faces, finer.normals if scheme.uses_normals else None)
+
+
+def first_control(mesh: js.ControlMesh, scheme: js.AbstractScheme) -> js.Control:
+    """The control that a fit of a mesh starts from: the surface goes, nearly, through the vertices of the mesh."""
+    control = mesh.control(weights=scheme.weights)
+    return control if scheme.interpolates else js.Control(_swollen(mesh, scheme), control.normals)
 
 
 def _swollen(mesh: js.ControlMesh, scheme: js.AbstractScheme) -> Float[np.ndarray, "v 3"]:

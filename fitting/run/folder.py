@@ -19,16 +19,18 @@ except ImportError:  # Windows: folders are not locked there
 SUMMARY = "summary.csv"
 FIT = "fit.npz"
 """What `fitting.load` reads; it is put in place after all other files."""
+LANDMARKS, CARRIED = "landmarks.mrk.json", "landmarks.csv"
+"""Landmarks that were carried to the fit, for 3D Slicer and as a table; beside the summary, a table of those of all."""
 RESULTS = ("control.obj", "surface.ply", "report.json", "fit.html", "recipe.json", "fit.png", FIT)
 """Of a fit without options."""
-_PLACED = (*SURFACE_FILES, *(name for name in RESULTS if name not in SURFACE_FILES))
+_PLACED = (*SURFACE_FILES, LANDMARKS, CARRIED, *(name for name in RESULTS if name not in SURFACE_FILES))
 _UNFINISHED = ".unfinished-"  # the folders of `jaxsubdiv.files.replacing` and of `fill`
 _OURS = {*_PLACED, CHECKPOINT, CHECKPOINT_START, SUMMARY}
 
 
 def results_in(folder: Path) -> set[str]:
     """Names of files that are results where they lie in this folder: of a fit only if it holds one, whole or not."""
-    return _OURS if (folder / FIT).exists() or is_unfinished(folder) else {SUMMARY}
+    return _OURS if (folder / FIT).exists() or is_unfinished(folder) else {SUMMARY, CARRIED}
 
 
 @contextmanager

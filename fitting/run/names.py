@@ -8,7 +8,7 @@ from itertools import count
 from pathlib import Path
 
 from ..image.read import is_image, stem
-from .folder import SUMMARY, results_in
+from .folder import CARRIED, SUMMARY, results_in
 
 _SCAN_FILES = {".ply", ".xyz", ".csv", ".txt", ".npz", ".vtp", ".vtk", ".stl", ".obj", ".off", ".gii"}
 _SCAN_FILES |= {".vtu", ".glb", ".pcd", ".pts", ".hsp"}
@@ -81,8 +81,8 @@ def _key(name: str) -> str:
 
 
 def _bad(name: str) -> bool:
-    """Whether a folder cannot have the name, as `..`, or not beside the summary."""
-    return _key(name) in ("", SUMMARY) or len(os.fsencode(name)) > _LONGEST
+    """Whether a folder cannot have the name, as `..`, or not beside the tables of all."""
+    return _key(name) in ("", SUMMARY, CARRIED) or len(os.fsencode(name)) > _LONGEST
 
 
 def _number(names: list[str]) -> list[str]:

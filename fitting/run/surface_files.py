@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import jaxsubdiv as js
+from jaxsubdiv.frames import Frame
 
 from ..report.at_level import SurfaceAtLevel
 
@@ -32,7 +33,7 @@ def check_formats(formats: Iterable[str]) -> None:
         js.check_can_write(_FILES[name], vertex_data=name in _WITH_DATA)
 
 
-def write_surface(folder: Path, at: SurfaceAtLevel, formats: Sequence[str]) -> list[str]:
+def write_surface(folder: Path, at: SurfaceAtLevel, formats: Sequence[str], frame: Frame | None = None) -> list[str]:
     """Write a surface, and the distances and deviations at its vertices where the format holds them.
 
     Returns:
@@ -40,7 +41,8 @@ def write_surface(folder: Path, at: SurfaceAtLevel, formats: Sequence[str]) -> l
     """
     values, written = {"distance_mm": at.distances, "deviation_mm": at.deviations}, []
     for name in dict.fromkeys(formats):
-        js.write_mesh(folder / _FILES[name], at.surface, vertex_data=values if name in _WITH_DATA else None)
+        of_vertices = values if name in _WITH_DATA else None
+        js.write_mesh(folder / _FILES[name], at.surface, vertex_data=of_vertices, frame=frame)
         written.append(_FILES[name])
         if name == "gii":
             js.write_mesh(folder / _DATA_OF_GIFTI, at.surface, vertex_data=values)

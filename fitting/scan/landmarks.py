@@ -2,18 +2,31 @@
 
 import json
 import reprlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 import jaxsubdiv as js
-from jaxsubdiv.tables import decode, read_table
+from jaxsubdiv.files import replacing
+from jaxsubdiv.frames import AXES, Frame, in_frame
+from jaxsubdiv.markups import read_control_points, write_control_points
+from jaxsubdiv.notices import warn
+from jaxsubdiv.tables import decode
 
 from .scan import ScanError
+
+SUFFIXES = (".json", ".csv", ".tsv", ".fcsv")
+_Row: TypeAlias = tuple[str, str, Any]
+"""A name, where it stands in the file, and what should be a position."""
+
+
+def name_suffixes() -> str:
+    """Of files of landmarks, for error texts."""
+    return f"{', '.join(SUFFIXES[:-1])} and {SUFFIXES[-1]}"
 
 
 class Landmarks(NamedTuple):
@@ -35,30 +48,49 @@ class Placed(NamedTuple):
     weights: Float[np.ndarray, "l"]
 
 
-def read_landmarks(path: str | Path, *, scale: float = 1.0) -> dict[str, Float[np.ndarray, "3"]]:
-    """Named positions from a JSON or CSV file, or one of control points of 3D Slicer (`.mrk.json`, `.fcsv`).
+class FramedLandmarks(NamedTuple):
+    """Named positions, and what their axes are."""
+
+    positions: dict[str, Float[np.ndarray, "3"]]
+    """In mm."""
+    frame: Frame | None
+    """None where neither the file says it nor the one who asked."""
+
+
+def read_landmarks(
+    path: str | Path, *, scale: float = 1.0, frame: Frame | None = None
+) -> dict[str, Float[np.ndarray, "3"]]:
+    """Named positions from a JSON or CSV file, or from a file of 3D Slicer (`.mrk.json`, `.fcsv`, exported tables).
 
     JSON holds an object of `"name": [x, y, z]`; a name may hold a list of positions as well, which become `name 1`,
-    `name 2` and so on. CSV holds rows of `name,x,y,z`, or a row of headings that names x, y, z and the names' column
-    `name` or `label`. Control points stay in the frame of their file, and a warning says which it is.
+    `name 2` and so on. CSV (or TSV) holds rows of `name,x,y,z`, or a row of headings in any order: the names are in the
+    column `name` or `label`, positions in `x`, `y`, `z`, or in `l`, `p`, `s` or `r`, `a`, `s` as 3D Slicer exports
+    them. Control points that were not placed are left out.
 
     Args:
         path: the file; its ending says which it is.
         scale: multiplies the coordinates; 1000 takes metres to mm.
+        frame: of the scan, or of the template, that the landmarks lie on (`Scan.frame`, `js.read_frame`): positions of
+            a file that says another are turned into it. Without one they stay in the frame of their file, and a warning
+            says which it is.
 
     Raises:
         ScanError: the file cannot be read, a position is not three finite numbers, or a name comes twice. The text
             names the file and the landmark or line.
     """
+    return read_framed_landmarks(path, scale=scale, frame=frame).positions
+
+
+def read_framed_landmarks(path: str | Path, *, scale: float = 1.0, frame: Frame | None = None) -> FramedLandmarks:
+    """The landmarks of `read_landmarks`, and the frame that they are in."""
     path = Path(path)
-    readers = {".json": _json_rows, ".csv": _csv_rows, ".fcsv": _control_points}
-    if path.suffix.lower() not in readers:
-        raise ScanError(
-            f"{path}: landmarks are read from .json, .csv and .fcsv files, not from {path.suffix or 'this'}."
-        )
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ScanError(f"{path}: landmarks are read from {name_suffixes()} files, not from {path.suffix or 'this'}.")
     landmarks: dict[str, Float[np.ndarray, "3"]] = {}
     try:
-        for name, where, values in readers[path.suffix.lower()](path):
+        rows, own = _json_rows(path) if suffix == ".json" else _control_points(path)
+        for name, where, values in rows:
             position = np.array(values, np.float64) * scale if _are_three_numbers(values) else np.full(3, np.nan)
             if not np.isfinite(position).all():
                 raise ScanError(
@@ -73,7 +105,49 @@ def read_landmarks(path: str | Path, *, scale: float = 1.0) -> dict[str, Float[n
         raise ScanError(f"landmarks cannot be read from {path.parent / ''}{error}") from None
     if not landmarks:
         raise ScanError(f"{path} holds no landmarks.")
-    return landmarks
+    if own is not None and frame is None:
+        warn(
+            f"{path.name}: positions are in {own} ({AXES[own]}), as the file says; scan and template must be in it too."
+        )
+    if own is not None and frame is not None:
+        landmarks = {name: in_frame(position, own, frame) for name, position in landmarks.items()}
+    return FramedLandmarks(landmarks, frame or own)
+
+
+def write_landmarks(
+    path: str | Path,
+    landmarks: Mapping[str, ArrayLike],
+    *,
+    frame: Frame | None = None,
+    deviations: Mapping[str, float] | None = None,
+) -> None:
+    """Write named positions in a format that `read_landmarks` reads, to the same positions and frame.
+
+    `.json` (name it `.mrk.json`) and `.fcsv` are files of 3D Slicer; where the frame is not known they say LPS, which
+    is what 3D Slicer takes for the frame of a mesh that names none. `.csv` and `.tsv` are tables with the columns
+    `name`, `x`, `y`, `z`, then `deviation_mm` where there are deviations, and `frame` where it is known.
+
+    Args:
+        path: the file; its ending says which it is to be. It appears once it is complete.
+        landmarks: positions in mm by name.
+        frame: what the axes are.
+        deviations: standard deviation of each in mm, by name: a column of a table, words in a file of 3D Slicer.
+
+    Raises:
+        ScanError: the ending is none of these, or a position is not three finite numbers.
+        OSError: the file cannot be written.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise ScanError(f"{path}: landmarks are written to {name_suffixes()} files, not to {path.suffix or 'this'}.")
+    positions = {name: np.asarray(position, np.float64) for name, position in landmarks.items()}
+    bad = [name for name, position in positions.items() if position.shape != (3,) or not np.isfinite(position).all()]
+    if bad:
+        raise ScanError(f"{path}: the landmarks {', '.join(bad)} are not three finite numbers x, y, z.")
+    spread = None if deviations is None else np.array([deviations[name] for name in positions], np.float64)
+    rows = np.array(list(positions.values())).reshape(-1, 3)
+    with replacing(path) as unfinished:
+        write_control_points(unfinished, rows, list(positions), frame=frame, deviations=spread)
 
 
 def match_landmarks(
@@ -144,7 +218,7 @@ def _are_three_numbers(values: Any) -> bool:
     return numbers and len(values) == 3 and all(abs(value) < 1e300 for value in values)
 
 
-def _json_rows(path: Path) -> Iterator[tuple[str, str, Any]]:
+def _json_rows(path: Path) -> tuple[list[_Row], Frame | None]:
     try:
         content = json.loads(decode(path.read_bytes()))
     except (ValueError, RecursionError) as error:  # also of numbers of thousands of digits, and of depth
@@ -152,29 +226,19 @@ def _json_rows(path: Path) -> Iterator[tuple[str, str, Any]]:
     if not isinstance(content, dict):
         raise ScanError(f"{path}: landmarks in JSON are an object of names, each with its position [x, y, z].")
     if "markups" in content:
-        yield from _control_points(path)
-        return
+        return _control_points(path)
+    rows: list[_Row] = []
     for name, value in content.items():
         if isinstance(value, list) and value and all(isinstance(item, list) for item in value):
-            yield from ((f"{name} {i}", f"'{name}'", item) for i, item in enumerate(value, 1))
+            rows += [(f"{name} {i}", f"'{name}'", item) for i, item in enumerate(value, 1)]
         else:
-            yield name, f"'{name}'", value
+            rows.append((name, f"'{name}'", value))
+    return rows, None
 
 
-def _csv_rows(path: Path) -> Iterator[tuple[str, str, Any]]:
-    table = read_table(path)
-    names = table.headings or ["name", "x", "y", "z"]
-    known = [name for name in ("name", "label", "landmark") if name in names] or [
-        name for name in names if len(name) > 1
-    ]
-    if not {"x", "y", "z"} <= set(names[: table.n_columns]) or not known:
-        raise ScanError(f"{path}, line {table.line}: landmarks need the columns name, x, y and z; it has {names}.")
-    positions = table.numbers([names.index(axis) for axis in "xyz"]).tolist()
-    of_rows = zip(table.texts(names.index(known[0])), table.lines, positions, strict=True)
-    yield from ((name, f"line {line}", position) for name, line, position in of_rows)
-
-
-def _control_points(path: Path) -> Iterator[tuple[str, str, Any]]:
-    cloud, columns = js.read_labelled_points(path, ("label",))
-    for i, (name, position) in enumerate(zip(columns["label"], cloud.points.tolist(), strict=True)):
-        yield name or f"{i + 1}", f"control point {i}, counted from zero", position
+def _control_points(path: Path) -> tuple[list[_Row], Frame | None]:
+    points = read_control_points(path)
+    if points.unit != "mm":
+        warn(f"{path.name}: positions are in {points.unit}, as the file says; `scale` turns them into mm.")
+    numbered = enumerate(zip(points.labels, points.places, points.positions.tolist(), strict=True), 1)
+    return [(label or f"{i}", place, position) for i, (label, place, position) in numbered], points.frame

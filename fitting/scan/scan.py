@@ -182,7 +182,8 @@ def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[st
 
     Faces of a mesh file are kept, see `Scan.faces`. A column `slice` of a CSV file, or another table with a header row,
     numbers the slices, and `frameID` does so in guide points of biv-me (`GPFile_000.txt`). Points that are not finite
-    are dropped, with a warning; see `jaxsubdiv.read_points` for all that a file may hold.
+    are dropped, with a warning; see `jaxsubdiv.read_points` for all that a file may hold. The frame is what the file
+    says, see `jaxsubdiv.read_frame`.
 
     Args:
         path: the file.
@@ -199,7 +200,7 @@ def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[st
     slices = None if _SLICE not in columns else _numbers(path, columns[_SLICE])
     words = [labels] if isinstance(labels, str) else list(labels)
     if not words:
-        return _scan(path, *cloud, None, slices, _faces_between(path, cloud.points, scale))
+        return _scan(path, *cloud, None, slices, _faces_between(path, cloud.points, scale), js.read_frame(path))
     of_rows = next((columns[name] for name in _LABELS if name in columns), [])
     chosen = np.array([any(word.casefold() in one.casefold() for word in words) for one in of_rows], bool)
     if not chosen.any():
@@ -207,10 +208,10 @@ def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[st
         wanted = " or ".join(f"'{word}'" for word in words)
         raise ScanError(f"{path.name}: no row has a label that holds {wanted}. It has: {there}.")
     kept = (None if rows is None else rows[chosen] for rows in (*cloud, None, slices))
-    return _scan(path, *kept)
+    return _scan(path, *kept, None, js.read_frame(path))
 
 
-def _scan(path: Path, *parts: np.ndarray | None) -> Scan:
+def _scan(path: Path, *parts: np.ndarray | Frame | None) -> Scan:
     try:
         with np.errstate(over="ignore"):  # what passes single precision is not finite, and told as such
             return Scan(*parts)  # pyright: ignore[reportArgumentType]

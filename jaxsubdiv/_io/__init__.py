@@ -17,10 +17,13 @@ from numpy.typing import ArrayLike
 from .._mesh import ControlMesh
 from ..errors import MeshError, name_rows
 from ..files import replacing
+from ..frames import Frame
+from ..markups import read_control_points
 from . import _arrays, _digitiser, _freesurfer, _gifti, _glb, _markups, _obj, _off, _pcd, _ply, _stl, _table, _vtk, _vtp
 from ._contents import Contents, VertexData, doubles, library, warn
+from ._frame import find_space
 
-__all__ = ["PointCloud", "Surface", "check_can_write", "read_mesh", "read_points", "write_mesh"]
+__all__ = ["PointCloud", "Surface", "check_can_write", "read_frame", "read_mesh", "read_points", "write_mesh"]
 
 
 class PointCloud(NamedTuple):
@@ -206,6 +209,20 @@ def read_labelled_points(
     }
 
 
+def read_frame(path: str | os.PathLike[str]) -> Frame | None:
+    """What a file of points or of a mesh says its axes are: "LPS" or "RAS"; None where it does not say.
+
+    3D Slicer writes `SPACE=LPS` into comments of `.ply`, `.obj`, `.stl` and `.vtk` files, and its control points
+    (`.mrk.json`, `.fcsv`) name their frame. Nothing is turned by it; see `jaxsubdiv.frames.in_frame`.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        MeshError: the suffix is not known, the file is empty, or holds no control points as its suffix says.
+    """
+    path, format_ = _open(path)
+    return read_control_points(path).frame if format_ is _MARKUPS else find_space(path)
+
+
 def _told_unit(path: Path, contents: Contents, scale: float | int) -> Contents:
     """The contents, after a warning where their format has a unit of its own and no scale was given."""
     if contents.usual_unit is not None and scale == 1:
@@ -224,7 +241,11 @@ def _present(path: Path, normals: Float[np.ndarray, "p 3"]) -> Float[np.ndarray,
 
 
 def write_mesh(
-    path: str | os.PathLike[str], mesh: Surface, *, vertex_data: Mapping[str, ArrayLike] | None = None
+    path: str | os.PathLike[str],
+    mesh: Surface,
+    *,
+    vertex_data: Mapping[str, ArrayLike] | None = None,
+    frame: Frame | None = None,
 ) -> None:
     """Write a mesh to a file of the format that the suffix names, so that it reads back the same bit for bit.
 
@@ -248,6 +269,8 @@ def write_mesh(
         mesh: a `ControlMesh` or a `RefinedSurface`.
         vertex_data: name -> one number a vertex, shape `[v]`, of any unit: distances, say. Kept by `.ply`, `.vtp` and
             `.vtk`, `.glb` and `.shape.gii`; an error elsewhere.
+        frame: what the axes are, where that is known: a comment of `.ply`, `.obj`, `.stl` and `.vtk` files says it to
+            3D Slicer and `read_frame`, and the others leave it out.
 
     Raises:
         FileNotFoundError: the folder does not exist.
@@ -261,7 +284,7 @@ def write_mesh(
     format_, write = _writable(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, "the folder does not exist, create it first", str(path.parent))
-    contents = _contents(path, mesh)
+    contents = _contents(path, mesh)._replace(frame=frame)
     data = _vertex_data(vertex_data or {}, len(contents.vertices))
     if data:
         _check_holds_data(path, format_)

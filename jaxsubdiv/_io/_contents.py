@@ -11,6 +11,7 @@ from jaxtyping import Float, Float32, Int, Shaped
 
 from .. import notices
 from ..errors import MeshError, name_rows
+from ..frames import Frame
 
 
 class Contents(NamedTuple):
@@ -23,6 +24,8 @@ class Contents(NamedTuple):
     weights: Float[np.ndarray, "v"] | None = None
     texts: Mapping[str, list[str]] = MappingProxyType({})
     """Columns of text beside the points, by heading."""
+    frame: Frame | None = None
+    """What the axes are, where that is known."""
     usual_unit: tuple[str, float] | None = None
     """The unit that programs of the format write, and the scale that takes it to mm; None where it says nothing."""
 

@@ -14,6 +14,7 @@ from ..errors import MeshError, name_rows
 from ..tables import decode
 from . import _mni
 from ._contents import Contents, VertexData, by_size, warn
+from ._frame import space_words
 from ._text import Rows, face_lines, number_lines, parse_rows, token_starts, tokens_per_line
 
 _INDEX = r"[+-]?[0-9]{1,9}"  # a mesh of more vertices would not fit 32 bits
@@ -105,7 +106,8 @@ def _indices(
 def write(path: Path, contents: Contents, data: VertexData) -> None:
     """`v`, `vn` where there are normals, and `f` with equal indices for both."""
     one_based = [faces + 1 for faces in (contents.faces or {}).values()]
-    text = number_lines(contents.vertices, "v ")
+    text = f"# {space_words(contents.frame)}\n" if contents.frame else ""
+    text += number_lines(contents.vertices, "v ")
     if contents.normals is None:
         text += face_lines(one_based, "f ")
     else:

@@ -13,6 +13,7 @@ from jaxtyping import Int, Shaped
 
 from ..errors import MeshError
 from ._contents import Contents, VertexData, check_polygons, doubles, whole
+from ._frame import space_words
 from ._text import Rows, parse_rows
 
 _TYPES = {
@@ -103,6 +104,7 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
     header = [
         "ply",
         "format binary_little_endian 1.0",
+        *(["comment " + space_words(contents.frame)] if contents.frame else []),
         f"element vertex {len(table)}",
         *(f"property {_NAMES[column.dtype.str[1:]]} {name}" for name, column in columns.items()),
         f"element face {sum(map(len, faces.values()))}",

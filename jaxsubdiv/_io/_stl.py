@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from ..errors import MeshError, name_rows
 from ..tables import decode
 from ._contents import Contents, VertexData, doubles, triangles_only, warn
+from ._frame import space_words
 from ._text import parse_rows
 
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
@@ -47,7 +48,8 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
     corners = contents.vertices[triangles_only(path, "STL", contents)]
     with np.errstate(over="ignore", invalid="ignore"):
         single = corners.astype(np.float32)
-    path.write_bytes(_binary(single) if (single == corners).all() else _text(corners).encode())
+    title = f"jaxsubdiv {space_words(contents.frame)}".strip()
+    path.write_bytes(_binary(single, title) if (single == corners).all() else _text(corners, title).encode())
 
 
 def _text_corners(path: Path, text: str) -> Float[np.ndarray, "c 3"]:
@@ -86,16 +88,16 @@ def _merge(corners: Float[np.ndarray, "c 3"]) -> tuple[Float[np.ndarray, "v 3"],
     return corners[first[by_appearance]], place[group]
 
 
-def _binary(corners: Float[np.ndarray, "t 3 3"]) -> bytes:
+def _binary(corners: Float[np.ndarray, "t 3 3"], title: str) -> bytes:
     facets = np.zeros(len(corners), _FACET)
     facets["corners"], facets["normal"] = corners, _facet_normals(corners)
-    return b"jaxsubdiv".ljust(80) + len(facets).to_bytes(4, "little") + facets.tobytes()
+    return title.encode().ljust(80) + len(facets).to_bytes(4, "little") + facets.tobytes()
 
 
-def _text(corners: Float[np.ndarray, "t 3 3"]) -> str:
+def _text(corners: Float[np.ndarray, "t 3 3"], title: str) -> str:
     facet = "facet normal {!r} {!r} {!r}\nouter loop\n" + 3 * "vertex {!r} {!r} {!r}\n" + "endloop\nendfacet\n"
     rows = np.concatenate([_facet_normals(corners), corners.reshape(-1, 9)], axis=1)
-    return "solid jaxsubdiv\n" + "".join(facet.format(*row) for row in rows.tolist()) + "endsolid jaxsubdiv\n"
+    return f"solid {title}\n" + "".join(facet.format(*row) for row in rows.tolist()) + f"endsolid {title}\n"
 
 
 def _facet_normals(corners: Float[np.ndarray, "t 3 3"]) -> Float[np.ndarray, "t 3"]:

@@ -13,6 +13,7 @@ from jaxtyping import Int, Shaped
 from ..errors import MeshError, name_rows
 from ._cells import polygons, strips, surface_cells, with_triangles
 from ._contents import Contents, VertexData, doubles, library
+from ._frame import space_words
 from ._text import parse_numbers, token_starts
 
 _NORMALS = "Normals"
@@ -146,6 +147,7 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
     else:
         writer = library("vtkmodules.vtkIOLegacy", ".vtk files").vtkPolyDataWriter()
         writer.SetFileTypeToBinary()
+        writer.SetHeader(f"jaxsubdiv {space_words(contents.frame)}".strip())
     writer.SetInputData(polydata)
     writer.SetFileName(str(path))
     done, messages = _watch(writer.Write)
