@@ -643,6 +643,14 @@ def test_series_are_refused(tmp_path):
         fitting.read_volume(tmp_path / "a.nii")
 
 
+def test_a_row_of_voxels_is_refused_before_it_is_read(tmp_path):
+    head = bytearray(NIFTI + bytes(4))
+    struct.pack_into("<3h", head, 42, 1, 1, 30_000)
+    (tmp_path / "a.nii").write_bytes(head)  # the voxels are missing
+    with pytest.raises(fitting.ScanError, match=r"^a.nii: it has \[1, 1, 30000\] voxels, which is no volume"):
+        fitting.read_volume(tmp_path / "a.nii")
+
+
 def test_importing_loads_no_library_of_images():
     code = (
         "import sys, fitting, jaxsubdiv\n"

@@ -93,9 +93,13 @@ def _check_header(path: Path, sizes: dict[int, int]) -> None:
         raise ScanError("its header is that of another file with the voxels, .img. Save both as one .nii.")
     if not 3 <= dims[0] <= 7 or min(dims[1 : dims[0] + 1]) < 1:
         raise ScanError(f"its header has the dimensions {list(dims)}; one volume [i, j, k] is read.")
+    shape = [int(dim) for dim in dims[1 : dims[0] + 1]]
+    if math.prod(shape[3:]) > 1:
+        raise ScanError(f"it has the shape {shape}; one volume [i, j, k] is read. Split it first.")
+    if min(shape[:3]) < 2:
+        raise ScanError(f"it has {shape[:3]} voxels, which is no volume.")
     if not 0 <= start <= _MOST_TEXT:  # also of NaN
         raise ScanError(f"its header announces {start:g} bytes before the voxels. It is damaged.")
     if kind not in sizes:
         raise ScanError(f"its voxels are of the type {kind}; those with one number each are read.")
-    n_bytes = math.prod(int(dim) for dim in dims[1 : dims[0] + 1]) * sizes[kind]
-    check_room(n_bytes, path.stat().st_size, DEFLATED if packed else 1)
+    check_room(math.prod(shape) * sizes[kind], path.stat().st_size, DEFLATED if packed else 1)
