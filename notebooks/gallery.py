@@ -1,4 +1,4 @@
-"""The README's gallery: `python notebooks/gallery.py` runs every notebook and saves the figure that it names `gallery`.
+"""The tutorials' pictures: `python notebooks/gallery.py` runs every notebook and saves what it names `gallery`.
 
 Arguments choose notebooks by their numbers: `python notebooks/gallery.py 02 04`.
 """

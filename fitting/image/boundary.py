@@ -11,7 +11,7 @@ from jaxsubdiv.notices import warn
 from ..scan.scan import Scan, ScanError
 from .volume import Label, Volume, mask_of
 
-MOST_POINTS = 200_000
+MOST_POINTS = 400_000
 _MOST_FITTED, _POINTS_A_FACE, _LEAST_FACES, _MOST_FACES = 40_000, 40, 300, 2000
 # Standard deviation in voxels of the Gaussian that the indicator is smoothed with for its normals: less leaves
 # stairs, more rounds the shape off (4.1, 3.1 and 3.1 degrees at 1, 1.5 and 2 on a head in voxels of 1 mm).
@@ -29,6 +29,10 @@ class _Crossings(NamedTuple):
     at: Float[np.ndarray, "p 3"]
     """Indices, between whole numbers along one axis."""
     axis: Int[np.ndarray, "p"]
+    middle: Int[np.ndarray, "p 3"]
+    """Twice the index of the middle of each pair of voxels."""
+    all: bool
+    """False where these are a part of all."""
 
 
 def scan_of_label(volume: Volume, label: Label, *, most_points: int = MOST_POINTS) -> Scan:
@@ -64,7 +68,7 @@ def scan_of_label(volume: Volume, label: Label, *, most_points: int = MOST_POINT
     _tell_thin(inside, found, outward, volume, str(label))
     across = np.einsum("px,px->p", outward, _axes(volume)[found.axis])
     deviations = volume.spacing[found.axis] * np.sqrt((across**2 + _TURNED**2) / 12)
-    return _scan(volume, low, found, outward, deviations)
+    return _scan(volume, low, inside, found, outward, deviations)
 
 
 def suggest_settings(scan: Scan) -> dict[str, int]:
@@ -106,21 +110,55 @@ def scan_above(volume: Volume, threshold: float, *, most_points: int = MOST_POIN
     least = 0.02 * volume.spacing.min()  # linear interpolation is no better
     noise = _noise(grey)
     deviations = np.clip(noise / np.maximum(size, 1e-30), least, volume.spacing.max())
-    return _scan(volume, low, found, _normals(slope, volume), deviations)
+    return _scan(volume, low, grey > threshold, found, _normals(slope, volume), deviations)
 
 
 def _scan(
     volume: Volume,
     low: Int[np.ndarray, "3"],
+    inside: Shaped[np.ndarray, "i j k"],
     found: _Crossings,
     outward: Float[np.ndarray, "p 3"],
     deviations: Float[np.ndarray, "p"],
 ) -> Scan:
     """The scan of what was found in a part of the volume that begins at `low`."""
     last = np.array(volume.layers[0].shape) - 1
-    to_view = np.linalg.inv(volume.affine)
-    to_view[:3] /= np.maximum(last, 1)[:, None]
-    return Scan(volume.positions(found.at + low), outward, deviations=deviations, frame=volume.frame, view=to_view)
+    view = np.linalg.inv(volume.affine)
+    view[:3] /= np.maximum(last, 1)[:, None]
+    points = volume.positions(found.at + low)
+    faces = _outline(inside, found, outward, points)
+    of_all = {"faces": faces, "frame": volume.frame, "outlined": faces is not None, "view": view}
+    return Scan(points, outward, deviations=deviations, **of_all)
+
+
+def _outline(
+    inside: Shaped[np.ndarray, "i j k"],
+    found: _Crossings,
+    outward: Float[np.ndarray, "p 3"],
+    points: Float[np.ndarray, "p 3"],
+) -> Int[np.ndarray, "t 3"] | None:
+    """Triangles between the points, wound outwards, open where the image ends; None where these are a part of all, or
+    without the extra `mesh`.
+
+    Those of marching cubes on the inside, whose vertices are the middles of the very same pairs of voxels.
+    """
+    if not found.all:
+        return None
+    try:
+        import pyvista
+    except ImportError:
+        return None
+    grid = pyvista.ImageData(dimensions=inside.shape)
+    grid["inside"] = inside.astype(np.float32).ravel(order="F")
+    stairs = grid.contour([0.5], "inside", method="flying_edges")
+    halves = tuple(2 * np.array(inside.shape))
+    keys = np.ravel_multi_index(tuple(found.middle.T), halves)
+    wanted = np.ravel_multi_index(tuple(np.round(2 * np.asarray(stairs.points)).astype(np.int64).T), halves)
+    order = np.argsort(keys)
+    faces = order[np.searchsorted(keys, wanted, sorter=order)][np.asarray(stairs.regular_faces)]
+    a, b, c = np.moveaxis(points[faces], 1, 0)
+    out = np.einsum("tx,tx->", np.cross(b - a, c - a), outward[faces].sum(axis=1))
+    return (faces if out > 0 else faces[:, ::-1]).astype(np.int32)
 
 
 def _widths(volume: Volume) -> Float[np.ndarray, "3"]:
@@ -152,16 +190,17 @@ def _find_crossings(values: Shaped[np.ndarray, "i j k"], threshold: float, most:
     counts = [int(np.count_nonzero(change)) for change in changes]
     n = sum(counts)
     rows = np.arange(n) if n <= most else np.sort(np.random.default_rng(0).choice(n, most, replace=False))
-    indices, axes = [], []
+    indices, middles, axes = [], [], []
     for axis, ((first, second), change) in enumerate(zip(pairs, changes, strict=True)):
         own = rows[(rows >= sum(counts[:axis])) & (rows < sum(counts[: axis + 1]))] - sum(counts[:axis])
         here = np.unravel_index(np.flatnonzero(change)[own], change.shape)
         a, b = (values[part][here].astype(np.float64) for part in (first, second))
+        middles.append(2 * np.stack(here, axis=1) + np.eye(3, dtype=np.int64)[axis])
         index = np.stack(here, axis=1).astype(np.float64)
         index[:, axis] += (threshold - a) / (b - a)
         indices.append(index)
         axes.append(np.full(len(index), axis))
-    return _Crossings(np.concatenate(indices), np.concatenate(axes))
+    return _Crossings(np.concatenate(indices), np.concatenate(axes), np.concatenate(middles), n <= most)
 
 
 def _slope(

@@ -217,7 +217,8 @@ def _restore(arrays: dict[str, np.ndarray]) -> Fit:
         raise ValueError(f"{settings.levels} levels of {mesh.n_faces} faces are more than a fit has. It is damaged.")
     topology = settings.topology(mesh)
     start = js.Control(on_device("template"), on_device("start_normals"))
-    scan = Scan(**{name: arrays.get(f"scan_{name}") for name in _OF_SCAN}, frame=_frame_of(arrays))
+    of_points: dict[str, Any] = {name: arrays.get(f"scan_{name}") for name in _OF_SCAN}
+    scan = Scan(**of_points, frame=_frame_of(arrays))
     inputs: dict[str, Any] = {"alike": arrays.get("alike")}
     if "anchor_points" in arrays:
         inputs["landmarks"] = Anchors(*(on_device(f"anchor_{name}") for name in Anchors._fields))

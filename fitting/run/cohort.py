@@ -272,15 +272,12 @@ def _fill_scene(scene: Scene, size: int, has_slices: bool) -> Scene:
         rows = jnp.asarray(rows)
         return jnp.pad(rows, [(0, size - n)] + [(0, 0)] * (rows.ndim - 1), **(how or {"mode": "edge"}))
 
-    values = (
+    whole = Scan(
         fill(scan.points),
         None if scan.normals is None else fill(scan.normals),
         fill(scan.weights_or_ones(), constant_values=0),
         fill(scan.relative_deviations(), constant_values=1),
-        None,
-        None,
     )
-    whole = eqx.tree_at(lambda s: tuple(vars(s).values()), scan, values, is_leaf=lambda leaf: leaf is None)
     around = type(scene.around)(*(fill(rows) for rows in scene.around))
     of_points = scene.of_points
     if has_slices:

@@ -77,6 +77,8 @@ class Scan(eqx.Module):
             does not keep them.
         frame: what the axes are, "RAS" (x to the right, y to the front, z up) or "LPS" (x to the left, y to the back, z
             up); None where that is not known. Nothing is turned by it: landmarks and results name it.
+        outlined: whether the faces are all of the surface that was seen, as the outline of a label is. A saved fit does
+            not keep it.
         view: of a scan that was seen in an image `[4, 4]`, takes positions to the unit cube that the image shows. A
             control mesh made from the scan ends there, as an open surface: what lies beyond was not seen. A saved fit
             does not keep it.
@@ -93,6 +95,7 @@ class Scan(eqx.Module):
     slices: Int[Array, "p"] | None = eqx.field(converter=_optional_whole, default=None)
     faces: Int[np.ndarray, "t 3"] | None = eqx.field(converter=_optional_faces, default=None)
     frame: Frame | None = eqx.field(static=True, default=None)
+    outlined: bool = eqx.field(static=True, default=False)
     view: Float[np.ndarray, "4 4"] | None = None
 
     def __check_init__(self):
@@ -155,7 +158,7 @@ class Scan(eqx.Module):
 
     def rows(self, chosen: Bool[np.ndarray, "p"] | Int[np.ndarray, "q"]) -> "Scan":
         """Some of the points, with all that is known of each."""
-        of_all = {"faces", "frame", "view"}
+        of_all = {"faces", "frame", "outlined", "view"}
         own = {name: value for name, value in vars(self).items() if name not in of_all and value is not None}
         faces = None
         if self.faces is not None:

@@ -15,6 +15,7 @@ from ..scan.closest_points import nearest_rows
 from ..scan.scan import Scan, ScanError
 from .align import sample_faces
 from .cloud import Cloud, clean
+from .outline import misses_thin_parts, parts_of_outline
 from .parts import Part, PartKind, choose, find_parts, points_of_others
 from .reconstruct import reconstruct_smoothly
 from .remesh import Coarse, Dense, coarsen, paired, relaxed
@@ -24,6 +25,7 @@ FaceKind: TypeAlias = Literal["triangle", "quad"]
 _LEAST_FACES = 16
 _SIZES = (1.0, 5000.0)  # mm: what is smaller or larger is hardly anatomy, but in another unit
 _SAMPLES, _FAR_OFF = 10_000, 0.3  # tips of what is long lie off a few faces, too: the fit reaches those
+_MORE = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0)  # times the faces asked for
 _MAD = 1.4826
 _CUT = 4.685
 _BENT = 0.2  # cosine
@@ -88,20 +90,27 @@ def make_control_mesh(scan: Scan, *, faces: int, kind: FaceKind, closed: bool | 
         raise ValueError(f"`faces` must be {_LEAST_FACES} or more; got {faces}.")
     _need_extra()
     cloud = clean(scan)
-    chosen, others, findings = choose(find_parts(cloud, closed), part)
+    parts = find_parts(cloud, closed)
+    thin = scan.outlined and closed is None and misses_thin_parts(parts, cloud)
+    parts = parts_of_outline(scan, cloud) if thin else parts
+    chosen, others, findings = choose(parts, part)
     findings = (*_unit_doubt(float(np.linalg.norm(np.ptp(cloud.points, axis=0)))), *findings)
     for finding in findings:
         warn(finding.text)
     area = sum(one.dense.areas.sum() for one in chosen)
-    meshes = [_mesh_of(one, max(_LEAST_FACES, round(faces * one.dense.areas.sum() / area)), kind) for one in chosen]
+    meshes = [
+        _mesh_of(one, max(_LEAST_FACES, round(faces * one.dense.areas.sum() / area)), kind, thin) for one in chosen
+    ]
     points = np.asarray(scan.points, np.float64)
     left_out = points_of_others(points, chosen, others) if others else np.zeros(len(points), bool)
     return Made(_side_by_side(meshes), findings, ~left_out)
 
 
-def _mesh_of(part: Part, faces: int, kind: FaceKind) -> js.ControlMesh:
+def _mesh_of(part: Part, faces: int, kind: FaceKind, thin: bool) -> js.ControlMesh:
     triangles = faces if kind == "triangle" else 2 * faces
-    coarse = coarsen(part.dense, triangles, part.topology)
+    # The two walls of something thin need clusters as small as it is thick, and its handles are true.
+    tries = (coarsen(part.dense, round(more * triangles), part.topology) for more in (_MORE if thin else (1.0,)))
+    coarse = next((found for found in tries if found is not None), None)
     if coarse is None and (smooth := _without_handles(part, triangles)) is not None:
         coarse = coarsen(smooth.dense, triangles, smooth.topology)
         if coarse is not None:

@@ -97,9 +97,9 @@ def _pieces_of_surface(cloud: Cloud, implicit: Implicit, closed: bool | None) ->
     shut = _contour(implicit, shut=True)
     tree = KDTree(cloud.points)
     if closed or (closed is None and _is_closed(cloud, shut, tree)):
-        return _separate(shut)
+        return separate(shut)
     dense = _contour(implicit, shut=False)
-    return _separate(_cut_back(dense, cloud, tree))
+    return separate(_cut_back(dense, cloud, tree))
 
 
 def _is_closed(cloud: Cloud, shut: Dense, tree: KDTree) -> bool:
@@ -206,7 +206,7 @@ def _pieces(dense: Dense, chosen: Bool[np.ndarray, "t"]) -> np.ndarray:
     return piece
 
 
-def _separate(dense: Dense) -> list[Dense]:
+def separate(dense: Dense) -> list[Dense]:
     """The pieces of a surface, the largest first, without specks."""
     if not len(dense.faces):
         return []

@@ -1,4 +1,4 @@
-"""After the timings of `bench_refine.py`: the ratios that the README quotes."""
+"""After the timings of `bench_refine.py`: the ratios that `docs/measurements.md` quotes."""
 
 RATIOS = (
     ("vertices, over C++", "jaxsubdiv, vertices", "C++, vertices"),

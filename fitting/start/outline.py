@@ -1,0 +1,41 @@
+"""The parts of a scan whose faces are all of the surface that was seen: the outline of a label."""
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ..scan.scan import Scan
+from .cloud import LEAST_POINTS, Cloud
+from .parts import Part
+from .reconstruct import separate
+from .remesh import Dense
+
+_ROUNDS, _PASS_BAND = 30, 0.05  # of windowed sinc: stairs go, and a coarse mesh has no finer detail
+_OFF = 2.0  # spacings of the points
+_OFTEN = 0.95
+
+
+def parts_of_outline(scan: Scan, cloud: Cloud) -> list[Part]:
+    """The pieces of the outline without its stairs, the largest first, each with the points near it."""
+    import pyvista
+
+    assert scan.faces is not None
+    stairs = pyvista.PolyData.from_regular_faces(np.asarray(scan.points, np.float64), scan.faces)
+    smooth = stairs.smooth_taubin(
+        n_iter=_ROUNDS, pass_band=_PASS_BAND, boundary_smoothing=False, normalize_coordinates=True
+    )
+    pieces = separate(Dense(np.asarray(smooth.points, np.float64), np.asarray(scan.faces)))
+    owner = np.repeat(np.arange(len(pieces)), [len(piece.vertices) for piece in pieces])
+    nearest = owner[KDTree(np.concatenate([piece.vertices for piece in pieces])).query(cloud.points, workers=-1)[1]]
+    parts: list[Part] = []
+    for i, dense in enumerate(pieces):
+        own = nearest == i
+        if own.sum() >= LEAST_POINTS or not parts:
+            points, normals, reach = (rows[own] for rows in (cloud.points, cloud.normals, cloud.reach))
+            parts.append(Part(cloud._replace(points=points, normals=normals, reach=reach), dense, dense.topology()))
+    return parts
+
+
+def misses_thin_parts(parts: list[Part], cloud: Cloud) -> bool:
+    """Whether points lie off a surface that was reconstructed from them: it is rounded off where the scan is thin."""
+    tree = KDTree(np.concatenate([part.dense.vertices for part in parts]))
+    return bool(np.quantile(tree.query(cloud.points, workers=-1)[0], _OFTEN) > _OFF * cloud.spacing)
