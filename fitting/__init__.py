@@ -54,6 +54,8 @@ from .scan.landmarks import Landmarks as Landmarks
 from .scan.landmarks import match_landmarks as match_landmarks
 from .scan.landmarks import read_landmarks as read_landmarks
 from .scan.landmarks import write_landmarks as write_landmarks
+from .scan.regions import RegionMatch as RegionMatch
+from .scan.regions import match_regions as match_regions
 from .scan.scan import Scan as Scan
 from .scan.scan import ScanError as ScanError
 from .scan.search_closest import search_closest as search_closest

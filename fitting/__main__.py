@@ -51,6 +51,7 @@ from .scan.landmarks import (
     read_landmarks,
     write_landmarks,
 )
+from .scan.regions import Groups, match_regions, read_groups
 from .scan.scan import Scan
 from .start.parts import PartKind
 
@@ -104,6 +105,7 @@ class _Job(NamedTuple):
     seen: Seen | None = None
     carried: FramedLandmarks | None = None
     """Places on the control mesh, to be carried to the fit."""
+    regions: Groups | None = None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -277,12 +279,14 @@ def _fit(scan: _Source | None, folder: Path, options: argparse.Namespace, recipe
         return _row(title, done, misfit(done), None)
     if job.mesh is not None:
         print(f"control  {len(job.mesh.vertices):,} vertices, {job.mesh.n_faces:,} faces, {_size(job.mesh.vertices)}")
+        _print_regions(job.scan, job.mesh, job.regions)
     with _Progress(recipe.max_sweeps) as progress:
         found = recipe.fit_scan(
             job.scan,
             job.mesh,
             landmarks=job.landmarks,
             boundary=job.boundary,
+            regions=job.regions,
             on_stage=progress.stage,
             throw=False,
             on_sweep=progress.update,
@@ -295,6 +299,17 @@ def _fit(scan: _Source | None, folder: Path, options: argparse.Namespace, recipe
     _save(folder, found, title, marks, job, options)
     _print_warnings(found.result)
     return _row(title, found.result, off, seconds)
+
+
+def _print_regions(scan: Scan, mesh: js.ControlMesh, groups: Groups | None) -> None:
+    """Tell of each label of the scan how many points it has, and which of the template's groups it is of."""
+    match = match_regions(scan, mesh, groups)
+    if match is None or scan.regions is None:
+        return
+    found = dict(match.groups)
+    for label, n in zip(scan.regions.names, scan.regions.counts(), strict=True):
+        where = f"on {' and '.join(found[label])}" if label in found else "no group's, paired with any face"
+        print(f"region   {label}: {n:,} points, {where}")
 
 
 def _slices_of(job: _Job, result: FitResult) -> Sequence[Slice]:
@@ -327,7 +342,9 @@ def _row(name: str, result: FitResult, off: float, seconds: float | None) -> dic
 
 def _marks(job: _Job, recipe: Recipe, options: argparse.Namespace) -> dict[str, str]:
     """What tells this fit from any other, by the names of what went in."""
-    inputs = {f"{name} of the scan": value for name, value in vars(job.scan).items()}
+    inputs = {f"{name} of the scan": value for name, value in vars(job.scan).items() if name != "regions"}
+    if job.mesh is not None and (match := match_regions(job.scan, job.mesh, job.regions)) is not None:
+        inputs["regions"] = match, job.scan.regions  # labels that no fit looks at are none of its inputs
     inputs["control mesh"] = None if job.mesh is None else (job.mesh.vertices, job.mesh.faces, job.mesh.normals)
     inputs |= {"landmarks": job.landmarks, "boundary": job.boundary}
     inputs |= {} if job.carried is None else {"carried landmarks": job.carried}
@@ -396,12 +413,17 @@ def _inputs(scan: _Source | None, options: argparse.Namespace, recipe: Recipe) -
     if mesh is None and (options.symmetry is not None or options.likeness is not None):
         which = "symmetry" if options.symmetry is not None else "likeness"
         raise ValueError(f"{which} is that of a template: give --control MESH to --{which}.")
+    regions = None
+    if options.regions is not None:
+        if mesh is None:
+            raise ValueError("regions are groups of a template's faces: give --control MESH to --regions.")
+        regions = read_groups(options.regions)
     boundary = None
     if options.boundary == "scan":
         boundary = BoundaryCurve(boundary_of(js.read_mesh(file, scale=options.scale, check=False)))
     elif options.boundary is not None:
         boundary = BoundaryCurve(js.read_points(options.boundary, scale=options.scale).points)
-    return _Job(scan.title(), points, mesh, landmarks, boundary, seen, carried)
+    return _Job(scan.title(), points, mesh, landmarks, boundary, seen, carried, regions)
 
 
 def _template(
@@ -417,7 +439,8 @@ def _template(
         return mesh, own
     print(f"note     the control mesh was turned from {own}, as its file says, to the scan's {of_scan}")
     normals = None if mesh.normals is None else in_frame(mesh.normals, own, of_scan)
-    return js.ControlMesh(in_frame(mesh.vertices, own, of_scan), mesh.faces, normals), of_scan
+    turned = in_frame(mesh.vertices, own, of_scan)
+    return js.ControlMesh(turned, mesh.faces, normals, regions=mesh.regions), of_scan
 
 
 def _ending(found: ScanFit, off: float) -> str:
@@ -580,6 +603,11 @@ def _parser() -> argparse.ArgumentParser:
     add("--tolerance", type=float, metavar="MM", help="split the control mesh until the surface is this near the scan")
     add("--points", type=int, metavar="N", help="fit no more than so many, drawn at random; all of them are measured")
     add("--labels", nargs="+", metavar="WORD", default=[], help="only rows of a table whose label holds one of these")
+    add(
+        "--regions",
+        metavar="FILE",
+        help="JSON, label of the scan: group of the template's faces; default: by the names",
+    )
     add("--label", metavar="LABEL", help="of a label map: a value, a name, or `all`, a fit each; default: the only one")
     add(
         "--above", type=float, metavar="VALUE", help="of a grey image: the value at the surface, which is lower outside"

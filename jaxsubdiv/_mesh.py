@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from ._control import Control
 from ._fans import mesh_fans
 from ._normals import Weights, estimate_normals
+from ._regions import Regions, as_regions
 from .errors import MeshError, name_rows
 from .half_edges import Faces, HalfEdges, half_edges
 from .linalg import of_moderate_length
@@ -30,18 +31,22 @@ class ControlMesh:
             array `[t, 3]` or `[q, 4]`, a pair of such arrays, or a dict `{3: [t, 3], 4: [q, 4]}`.
         normals: `[v, 3]`, one a vertex, of any length, or None. A zero normal gives no bend from its end.
         check: False puts off every check but those of the shapes, so that `repaired()` can be called.
+        regions: of the faces, triangles first and then quads: `Regions`, or a name each, empty where a face lies in
+            none; or None.
 
     Raises:
         MeshError: the mesh is empty; a coordinate or a normal is not finite; a face has an index out of range, a
             repeated corner, five or more corners or no area; an edge has more than two faces; neighbours are oriented
-            oppositely; the normals are not one a vertex. The text names the rows. Unused vertices and several
-            components are legal.
+            oppositely; the normals are not one a vertex, or the regions not one a face. The text names the rows. Unused
+            vertices and several components are legal.
     """
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Faces
     """`{3: [t, 3], 4: [q, 4]}`, both always present; the order of the input is kept within each."""
     normals: Float[np.ndarray, "v 3"] | None
+    regions: Regions | None
+    """Of the faces, triangles first and then quads, such as the groups of an OBJ file."""
     repairs: tuple[str, ...]
     """What `repaired()` did to get here, a sentence each; empty otherwise."""
 
@@ -53,10 +58,12 @@ class ControlMesh:
         *,
         check: bool = True,
         repairs: Sequence[str] = (),
+        regions: Regions | Sequence[str] | None = None,
     ):
         self.vertices = _rows_of_three(vertices, "vertices")
         self.faces, self._names = _sort_faces(faces)
         self.normals = None if normals is None else of_moderate_length(_rows_of_three(normals, "normals"))
+        self.regions = _regions_of_faces(regions, self.n_faces)
         self.repairs = tuple(repairs)
         self._checked = False
         for array in (self.vertices, self.normals, *self.faces.values()):
@@ -144,7 +151,12 @@ class ControlMesh:
         """A copy with every quad cut from its first to its third corner, after the triangles that there are."""
         quads = self.faces[4]
         halves = np.stack([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
-        return ControlMesh(self.vertices, {3: np.concatenate([self.faces[3], halves])}, self.normals)
+        regions = self.regions
+        if regions is not None:
+            rows = np.arange(self.n_faces)
+            regions = regions.take(np.repeat(rows, np.where(rows < len(self.faces[3]), 1, 2)))
+        faces = {3: np.concatenate([self.faces[3], halves])}
+        return ControlMesh(self.vertices, faces, self.normals, regions=regions)
 
     def name_faces(self, rows: ArrayLike) -> str:
         """Faces, triangles numbered first and then quads, by the words of whoever passed them."""
@@ -163,6 +175,16 @@ class _FaceNames:
             return f"face{'s' * (len(rows) != 1)} {name_rows(np.sort(self._places[rows]))}"
         named = (f"triangle {r}" if r < self._n_triangles else f"quad {r - self._n_triangles}" for r in np.sort(rows))
         return name_rows(named)
+
+
+def _regions_of_faces(regions: Regions | Sequence[str] | None, n_faces: int) -> Regions | None:
+    try:
+        found = as_regions(regions)
+    except ValueError as error:
+        raise MeshError(f"`regions`: {error}") from None
+    if found is not None and len(found) != n_faces:
+        raise MeshError(f"there are {len(found)} `regions` for {n_faces} faces. Give one a face, triangles first.")
+    return found
 
 
 def _rows_of_three(values: ArrayLike, name: str) -> Float[np.ndarray, "n 3"]:

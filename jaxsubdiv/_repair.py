@@ -43,7 +43,7 @@ def repair(mesh: ControlMesh, merge_within: float | None) -> ControlMesh:
         if not again.repairs:
             break
         notes = found.repairs + again.repairs
-        found = ControlMesh(again.vertices, again.faces, again.normals, repairs=notes)
+        found = ControlMesh(again.vertices, again.faces, again.normals, repairs=notes, regions=again.regions)
     return found
 
 
@@ -59,7 +59,8 @@ def _repair_once(mesh: ControlMesh, merge_within: float | None) -> tuple[Control
     normals = None if mesh.normals is None else _mend_normals(work, _take_normals(work, mesh.normals), reversed_faces)
     # Vertices doubled on purpose, to part two solids that touch, were merged and split into the same rows again.
     notes = () if _unchanged(work, normals) else work.notes
-    return ControlMesh(work.vertices, work.faces, normals, repairs=notes), was_split
+    regions = None if mesh.regions is None else mesh.regions.take(work.origins)
+    return ControlMesh(work.vertices, work.faces, normals, repairs=notes, regions=regions), was_split
 
 
 class _Work:

@@ -14,6 +14,7 @@ from jaxsubdiv.linalg import dot, norm, unit
 
 from ..scan.closest_points import boundary_vertices, nearest_rows
 from ..scan.outliers import NEIGHBOURS, is_dense, rows_for_density, scattered_points
+from ..scan.regions import Choice
 from ..scan.scan import Scan
 from ..scan.slices import Strokes, find_strokes
 from .priors.shifts import SlicePlanes
@@ -95,17 +96,23 @@ class Scene(NamedTuple):
     """The row of the slice of each point that may be shifted, -1 where it stays; None where none may."""
     open_vertices: Bool[Array | np.ndarray, "v"]
     """Which vertices of the surface lie on a boundary."""
+    choice: Choice | None = None
+    """The faces of the surface that each point may be paired with; None where all may be with any."""
 
 
-def make_scene(scan: Scan, surface: js.RefinedSurface, planes: SlicePlanes | None = None) -> Scene:
+def make_scene(
+    scan: Scan, surface: js.RefinedSurface, planes: SlicePlanes | None = None, choice: Choice | None = None
+) -> Scene:
     """The scene of a scan.
 
     Args:
         surface: any that has the faces of those to come.
         planes: of the slices that may be shifted.
+        choice: the faces that each point may be paired with; default: all.
     """
     of_points = None if planes is None else planes.rows_of(scan)
-    return Scene(scan.without_slices(), surroundings(scan), find_strokes(scan), of_points, boundary_vertices(surface))
+    open_vertices = boundary_vertices(surface)
+    return Scene(scan.without_slices(), surroundings(scan), find_strokes(scan), of_points, open_vertices, choice)
 
 
 def empty_look(scene: Scene) -> Look:

@@ -15,6 +15,7 @@ from ..model.pairing import Look, Scene
 from ..model.recipe import Settings
 from ..model.residual import Held, Model
 from ..model.unknowns import Variables
+from ..scan.regions import Choice, RegionMatch
 from ..scan.scan import Scan
 from ..solve.sparse_normal import SparseEquations, find_structure
 from ..solve.strengths import Strengths
@@ -98,6 +99,11 @@ class Fit:
         return np.einsum("sj,sjx->sx", np.asarray(self.y.shared["shifts"], np.float64), np.asarray(prior.planes))
 
     @property
+    def regions(self) -> RegionMatch | None:
+        """Of the control faces, and of labels; None where there are none."""
+        return self.inputs.get("regions")
+
+    @property
     def slices(self) -> Int[np.ndarray, "s"]:
         """Their numbers."""
         prior: Any = self.model.prior("shift")
@@ -117,6 +123,14 @@ class Fit:
         held = self.held()
         structure = find_structure(self.model, self.y, held.priors)
         return SparseEquations(structure, self.model, self.y, held)
+
+
+def choose_faces(regions: RegionMatch | None, model: Model, y: Variables, scan: Scan) -> Choice | None:
+    """The faces of the surface that each point of a scan may be paired with; None where all may be with any."""
+    if regions is None or not regions.groups:
+        return None
+    owner = js.control_faces_of(model.scheme, model.topology, model.refine(y), y.control)
+    return regions.choice(scan, owner)
 
 
 def look_at(model: Model, y: Variables, scene: Scene, loss: Any) -> Look:

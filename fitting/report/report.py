@@ -39,6 +39,22 @@ class SliceShift:
 
 
 @dataclasses.dataclass(frozen=True)
+class RegionDistance:
+    """How far the points of a region lie from the surface.
+
+    Attributes:
+        region: the template's group that they were paired within, or groups; "any region" of points with no group.
+        n_points: how many.
+        rms, median: of their absolute distance, in mm.
+    """
+
+    region: str
+    n_points: int
+    rms: float
+    median: float
+
+
+@dataclasses.dataclass(frozen=True)
 class Report:
     """The numbers of a fit; distances in mm. They are from the scan's points to the surface where nothing else is said.
 
@@ -71,6 +87,7 @@ class Report:
         uncertainty_median, uncertainty_95: median and 95th percentile, over the covered area, of the surface's standard
             deviation; None where it was not asked for.
         shifts: of the slices of the scan, which the distances have been measured after; empty where none was free.
+        regions: the distances within each region; empty where points are paired with any face.
         worst: up to five places where the scan lies farthest from the surface, one control edge apart.
     """
 
@@ -108,6 +125,7 @@ class Report:
     uncertainty_median: float | None
     uncertainty_95: float | None
     shifts: list[SliceShift]
+    regions: list[RegionDistance]
     worst: list[WorstPlace]
 
     def __str__(self) -> str:
@@ -163,6 +181,8 @@ class Report:
             far = [math.hypot(*one.shift) for one in self.shifts]
             root = math.sqrt(sum(length**2 for length in far) / len(far))
             rows.append(("slices shifted", f"{len(far)}, by RMS {root:.2f} mm and {max(far):.2f} mm at most"))
+        for one in self.regions:
+            rows.append((f"RMS in {one.region}", f"{one.rms:.3f} mm, median {one.median:.3f}, {one.n_points:,} points"))
         for i, place in enumerate(self.worst):
             at = ", ".join(f"{x:.1f}" for x in place.position)
             rows.append((f"worst place {i + 1}", f"{place.distance:+.3f} mm at ({at}), {place.n_points:,} points"))

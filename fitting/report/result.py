@@ -22,9 +22,9 @@ from .coverage import distances_to_scan, vertex_areas, weighted_quantile, worst_
 from .evidence import gather_evidence
 from .findings import find_what_speaks_against
 from .posterior import Posterior, Uncertainty
-from .record import Fit, look_at
+from .record import Fit, choose_faces, look_at
 from .refit import Refit, make_refit
-from .report import Report, SliceShift, WorstPlace
+from .report import RegionDistance, Report, SliceShift, WorstPlace
 from .saved import save_fit
 
 
@@ -119,7 +119,9 @@ class FitResult:
     @functools.cached_property
     def control_mesh(self) -> js.ControlMesh:
         """The fitted control mesh with its normals, for `js.write_mesh`."""
-        return js.ControlMesh(self.control.vertices, self.fit.topology.control_faces, self.control.normals, check=False)
+        regions = None if self.fit.regions is None else self.fit.regions.faces
+        faces, normals = self.fit.topology.control_faces, self.control.normals
+        return js.ControlMesh(self.control.vertices, faces, normals, check=False, regions=regions)
 
     def refit(self) -> Refit:
         """The fitted control as a differentiable function of scan points and weights; see `Refit`.
@@ -145,7 +147,7 @@ class FitResult:
         """
         fit = self.fit
         planes = None if not fit.shifting or scan.slices is None else fit.inputs.get("slices")
-        scene = make_scene(scan, self.surface, planes)
+        scene = make_scene(scan, self.surface, planes, choose_faces(fit.regions, fit.model, fit.y, scan))
         look = look_at(fit.model, fit.y, scene, fit.settings.loss)
         rms, robust_rms = (
             np.append(values[:-1], float(new))
@@ -222,11 +224,28 @@ class FitResult:
             uncertainty_median=None if spread is None else weighted_quantile(spread, share, 0.5),
             uncertainty_95=None if spread is None else weighted_quantile(spread, share, 0.95),
             shifts=[SliceShift(int(i), shift.tolist()) for i, shift in zip(self.slices, self.shifts, strict=True)],
+            regions=_distances_of_regions(self.fit),
             worst=[
                 WorstPlace(place.position.tolist(), place.distance, place.n_points)
                 for place in worst_places(self.surface, self.fit.look, self.distances, edge)
             ],
         )
+
+
+def _distances_of_regions(fit: Fit) -> list[RegionDistance]:
+    """Of the points that were paired within each region, and of those that were with any face."""
+    if fit.scene.choice is None or fit.regions is None:
+        return []
+    distances, of_points = np.asarray(fit.look.distances), np.asarray(fit.scene.choice.of_points)
+    weights = np.asarray(fit.scan.relative_weights())
+    names = [" + ".join(kind) for kind in fit.regions.kinds] + ["any region"]
+    found = []
+    for row, name in zip([*range(len(names) - 1), -1], names, strict=True):
+        own = (of_points == row) & (weights > 0)
+        if own.any():
+            rms = float(np.sqrt(np.average(distances[own] ** 2, weights=weights[own])))
+            found.append(RegionDistance(name, int(own.sum()), rms, float(np.median(np.abs(distances[own])))))
+    return found
 
 
 def _count_unknowns(fit: Fit) -> int:

@@ -27,10 +27,11 @@ from ..model.priors.symmetry import symmetry_of
 from ..model.recipe import Settings
 from ..model.residual import Model, Pairs, analyse
 from ..model.unknowns import Variables
+from ..scan.regions import RegionMatch
 from ..scan.scan import Scan
 from ..solve.strengths import Strengths
 from ..solve.sweeps import shift_points
-from .record import Fit
+from .record import Fit, choose_faces
 
 _VERSIONS = (3, 4)  # 1 had no likeness, 2 not what held the unknowns; 4 has strengths and shared unknowns by name
 _FIT, _RECIPE = "fit.npz", "recipe.json"
@@ -91,6 +92,7 @@ def save_fit(
     for name in _OF_SCAN:
         arrays[f"scan_{name}"] = getattr(fit.scan, name)
     arrays["frame"] = fit.scan.frame
+    arrays |= _arrays_of_regions(fit.scan.regions, fit.regions)
     inputs = fit.inputs
     arrays["alike"] = inputs.get("alike")
     arrays["marks"] = None if marks is None else json.dumps(marks)
@@ -206,6 +208,32 @@ def _frame_of(arrays: dict[str, np.ndarray]) -> Frame | None:
     return frame
 
 
+def _arrays_of_regions(of_scan: js.Regions | None, match: RegionMatch | None) -> dict[str, Any]:
+    arrays = {}
+    if of_scan is not None:
+        arrays |= {"scan_regions": of_scan.rows, "scan_region_names": json.dumps(of_scan.names)}
+    if match is not None:
+        arrays |= {"face_regions": match.faces.rows, "face_region_names": json.dumps(match.faces.names)}
+        arrays["region_groups"] = json.dumps(dict(match.groups))
+    return arrays
+
+
+def _regions_of(arrays: dict[str, np.ndarray], what: str) -> js.Regions | None:
+    if f"{what}_regions" not in arrays:
+        return None
+    return js.Regions(arrays[f"{what}_regions"], json.loads(str(arrays[f"{what}_region_names"])))
+
+
+def _match_of(arrays: dict[str, np.ndarray], n_faces: int) -> RegionMatch | None:
+    faces = _regions_of(arrays, "face")
+    if faces is None:
+        return None
+    if len(faces) != n_faces:
+        raise ValueError(f"'face_regions' has {len(faces)} rows for {n_faces} control faces.")
+    groups = json.loads(str(arrays["region_groups"]))
+    return RegionMatch(faces, tuple((label, tuple(names)) for label, names in groups.items()))
+
+
 def _restore(arrays: dict[str, np.ndarray]) -> Fit:
     def on_device(name: str) -> Array:
         values = arrays[name]
@@ -218,8 +246,8 @@ def _restore(arrays: dict[str, np.ndarray]) -> Fit:
     topology = settings.topology(mesh)
     start = js.Control(on_device("template"), on_device("start_normals"))
     of_points: dict[str, Any] = {name: arrays.get(f"scan_{name}") for name in _OF_SCAN}
-    scan = Scan(**of_points, frame=_frame_of(arrays))
-    inputs: dict[str, Any] = {"alike": arrays.get("alike")}
+    scan = Scan(**of_points, frame=_frame_of(arrays), regions=_regions_of(arrays, "scan"))
+    inputs: dict[str, Any] = {"alike": arrays.get("alike"), "regions": _match_of(arrays, mesh.n_faces)}
     if "anchor_points" in arrays:
         inputs["landmarks"] = Anchors(*(on_device(f"anchor_{name}") for name in Anchors._fields))
     if "symmetry_partner" in arrays:
@@ -247,7 +275,7 @@ def _restore(arrays: dict[str, np.ndarray]) -> Fit:
     if not ((face >= 0) & (face < surface.n_faces)).all():
         raise ValueError(f"'face' has rows of faces that there are not; the surface has {surface.n_faces}.")
     shifting = bool(arrays["shifting"])
-    scene = make_scene(scan, surface, inputs.get("slices"))
+    scene = make_scene(scan, surface, inputs.get("slices"), choose_faces(inputs["regions"], model, y, scan))
     points = scan.points
     if shifting and scene.of_points is not None:
         points = points + shift_points(model, y.shared["shifts"], scene.of_points).astype(points.dtype)

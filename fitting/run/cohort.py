@@ -74,7 +74,8 @@ def fit_cohort(
     Args:
         scheme, topology: as in `fit`.
         controls: where the fits start: one control for all, or one a scan, aligned with it (see `align`).
-        scans: in mm. They may differ in length; all have normals, or none.
+        scans: in mm. They may differ in length; all have normals, or none. Points are paired with any face, whatever
+            their regions.
         free, loss, max_sweeps, tolerance: as in `fit`.
         priors: as in `fit`; strengths that `fit` would find from the scan are those of the pilot, place by place: with
             `bend=None`, the default, the smoothness; with `likeness=None` how much of each control mesh's own shape is

@@ -27,9 +27,10 @@ from ..model.recipe import Settings
 from ..model.residual import Model, analyse
 from ..model.robust import AbstractLoss, geman_mcclure
 from ..model.unknowns import Free, Variables
-from ..report.record import Fit
+from ..report.record import Fit, choose_faces
 from ..report.result import FitResult
 from ..scan.landmarks import Landmarks
+from ..scan.regions import RegionMatch
 from ..scan.scan import Scan, ScanError
 from ..solve.conjugate_gradients import ConjugateGradients
 from ..solve.sparse_normal import SparseNormal, find_structure
@@ -75,6 +76,7 @@ def fit(
     symmetry: Symmetry | None = None,
     boundary: BoundaryCurve | None = None,
     alike: Bool[np.ndarray, "f"] | None = None,
+    regions: RegionMatch | None = None,
     linear_solver: LinearSolver | None = None,
     max_sweeps: int = 60,
     tolerance: float = 0.1,
@@ -111,6 +113,8 @@ def fit(
             points beyond it do not count.
         alike: control faces whose shape where the fit starts says what to expect, see `Priors.likeness`; triangles
             first. Default: all.
+        regions: which control faces the points of each label of the scan lie on, by `match_regions`: they are paired
+            with the closest place of these. Points of other labels, or of none, are paired with any.
         linear_solver: "sparse" solves the normal equations of each sweep on the host, "conjugate gradients" pairs and
             solves where JAX computes; default: "sparse" on the CPU, else the other. Both come to the same surface.
         max_sweeps: how many sweeps at most.
@@ -140,16 +144,21 @@ def fit(
     if alike is not None and alike.shape != (topology.n_control_faces,):
         n_faces = topology.n_control_faces
         raise ValueError(f"`alike` must say it of each of the {n_faces} control faces; got {list(alike.shape)}.")
+    if regions is not None and len(regions.faces) != topology.n_control_faces:
+        raise ValueError(
+            f"`regions` are of {len(regions.faces)} control faces, and the topology has {topology.n_control_faces}. "
+            "Match the scan with the control mesh that the topology was made from."
+        )
     control = sound_start(scheme, topology, control, free)
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
     settings["landmark_deviation"] = landmark_deviation
     given = {"scheme": scheme, "topology": topology, "control": control, "scan": scan, "landmarks": landmarks}
-    given |= {"symmetry": symmetry, "boundary": boundary, "alike": alike, "solver": linear_solver}
+    given |= {"symmetry": symmetry, "boundary": boundary, "alike": alike, "solver": linear_solver, "regions": regions}
     kept = None if checkpoint is None else Checkpoint(Path(checkpoint) / CHECKPOINT, given | settings)
     inputs = gather_inputs(scheme, topology, control, scan, free, landmarks, landmark_deviation, boundary)
-    inputs |= {"symmetry": symmetry, "alike": alike}
+    inputs |= {"symmetry": symmetry, "alike": alike, "regions": regions}
     model, y = analyse(scheme, topology, control, free, priors, inputs)
-    scene = make_scene(scan, model.refine(y), inputs["slices"])
+    scene = make_scene(scan, model.refine(y), inputs["slices"], choose_faces(regions, model, y, scan))
     solver = make_solver(model, y, scene, linear_solver, loss, tolerance, max_sweeps)
     subject, nothing = Subject(model, scene), frozenset()
     state = solver.init(subject_residual, y, subject, {}, None, None, nothing)

@@ -22,6 +22,7 @@ from ..model.recipe import Settings
 from ..report.result import FitResult
 from ..scan.closest_points import nearest_rows
 from ..scan.landmarks import Landmarks
+from ..scan.regions import Groups, match_regions
 from ..scan.scan import Scan
 from ..start.align import Alignment, Kind, align, mirror_image, put
 from ..start.control_mesh import FaceKind, make_control_mesh
@@ -81,6 +82,7 @@ def fit_scan(
     pose: Kind | None = Settings.pose,
     mirror: bool = Settings.mirror,
     landmarks: Landmarks | None = None,
+    regions: Groups | None = None,
     tolerance_mm: float | None = Settings.tolerance_mm,
     most_faces: int = Settings.most_faces,
     most_points: int | None = Settings.most_points,
@@ -101,6 +103,9 @@ def fit_scan(
         pose: how the template may move to the scan before the fit, see `align`; None leaves it where it is.
         mirror: take the template's mirror image, which serves the other side of the body.
         landmarks: places on scan and template, for the alignment and the fit; see `Landmarks`.
+        regions: where the template has groups of faces, and the scan labels: the group, or groups, that points of a
+            label are paired within, None for any face, before what the names say; see `match_regions`. Points of labels
+            that are no group's are paired with any face. The alignment does not look at regions.
         tolerance_mm: split the control mesh by the scheme's own rule, and fit again, until the misfit (see `misfit`) is
             this small, or too small to be told from the noise, or the next split would make too many faces for
             `most_faces` or for two points a control vertex. Where a split mesh has no scan points it is expected to
@@ -119,6 +124,10 @@ def fit_scan(
             is no template; or `mirror` is given without a pose.
         ScanError, ValueError, ImportError, RuntimeError: as `align`, `control_mesh` and `fit` do.
     """
+    if mesh is None and regions:
+        raise ValueError("`regions` are groups of a template's faces, and there is none: give one, or leave them out.")
+    # Before anything is computed: what cannot be matched is told at once.
+    match = None if mesh is None else match_regions(scan, mesh, regions)
     numbers = {"levels": levels, "faces": faces, "tolerance_mm": tolerance_mm, "most_faces": most_faces}
     numbers |= {"most_points": most_points}
     numbers |= {name: options[name] for name in ("max_sweeps", "tolerance", "landmark_deviation") if name in options}
@@ -142,7 +151,7 @@ def fit_scan(
         mesh, landmarks = mirror_image(mesh, landmarks)
     kept = before = None
     if checkpoint is not None:
-        template = None if mesh is None else (mesh.vertices, mesh.faces, mesh.normals)
+        template = None if mesh is None else (mesh.vertices, mesh.faces, mesh.normals, match)
         inputs = {"scan": scan, "mesh": template, "scheme": first, "levels": levels, "landmarks": landmarks}
         inputs |= {name: value for name, value in options.items() if name not in ("throw", "on_sweep")}
         kept = Checkpoint(Path(checkpoint) / CHECKPOINT_START, inputs | settings | of_tables)
@@ -187,6 +196,7 @@ def fit_scan(
         here = {
             "landmarks": of_first,
             "symmetry": partners,
+            "regions": match_regions(scan, start.mesh, regions),
             "checkpoint": checkpoint,
             "keep_checkpoint": keep_checkpoint,
         }
@@ -240,15 +250,17 @@ def _arrays(start: _Start) -> dict[str, Any]:
     arrays = {"vertices": mesh.vertices, "triangles": mesh.faces[3], "quads": mesh.faces[4], "normals": mesh.normals}
     arrays |= {"h": start.scheme.h, "splits": start.splits, "unseen": start.unseen, "origin": start.origin.to_json()}
     arrays["shown"] = start.shown
+    arrays["regions"] = None if mesh.regions is None else mesh.regions.rows
     if alignment is None:
         return arrays
     return arrays | {"transform": alignment.transform, "rms": alignment.rms, "share": alignment.share}
 
 
 def _recalled(arrays: dict[str, np.ndarray], scheme: js.AbstractScheme, template: js.ControlMesh | None) -> _Start:
-    mesh = js.ControlMesh(
-        arrays["vertices"], {3: arrays["triangles"], 4: arrays["quads"]}, arrays.get("normals"), check=False
-    )
+    faces, regions = {3: arrays["triangles"], 4: arrays["quads"]}, None
+    if template is not None and template.regions is not None:
+        regions = js.Regions(arrays["regions"], template.regions.names)
+    mesh = js.ControlMesh(arrays["vertices"], faces, arrays.get("normals"), check=False, regions=regions)
     if scheme.h is not None:
         scheme = eqx.tree_at(lambda s: s.h, scheme, jnp.asarray(arrays["h"]))
     alignment, origin = None, Origin.from_json(str(arrays["origin"]))
@@ -293,8 +305,12 @@ def split(scheme: js.AbstractScheme, mesh: js.ControlMesh, control: js.Control) 
     if scheme.h is not None and scheme.h.ndim:  # one h a level: what is left of it serves the split mesh
         scheme = dataclasses.replace(scheme, h=scheme.h[:1])
     bare = js.ControlMesh(control.vertices, mesh.faces, check=False)
-    finer = js.refine(scheme, js.build_topology(bare, scheme, 1), control)
-    return js.ControlMesh(finer.vertices, finer.faces, finer.normals if scheme.uses_normals else None)
+    topology, regions = js.build_topology(bare, scheme, 1), mesh.regions
+    finer = js.refine(scheme, topology, control)
+    if regions is not None:
+        regions = regions.take(js.control_faces_of(scheme, topology, finer, control))
+    normals = finer.normals if scheme.uses_normals else None
+    return js.ControlMesh(finer.vertices, finer.faces, normals, regions=regions)
 
 
 def first_control(mesh: js.ControlMesh, scheme: js.AbstractScheme) -> js.Control:

@@ -11,6 +11,7 @@ import jaxsubdiv as js
 from ..model.recipe import Settings
 from ..report.result import FitResult
 from ..report.saved import load_fit
+from ..scan.regions import match_regions
 from ..scan.scan import Scan
 from . import fit as _fit
 from . import fit_scan as _fit_scan
@@ -25,13 +26,14 @@ class Recipe(Settings):
         """Fit a control mesh to a scan in this way.
 
         Args:
-            mesh: where the fit starts, roughly aligned with the scan and in mm.
+            mesh: where the fit starts, roughly aligned with the scan and in mm. Where it has groups of faces, labels of
+                the scan are matched with them by their names, see `match_regions`.
             scan: the measured points in mm.
             options: more for `fit`, such as `throw` and `on_sweep`; they come before the recipe's own.
         """
         own = {"free": self.free, "priors": self.priors, "loss": self.loss}
         own |= {"max_sweeps": self.max_sweeps, "tolerance": self.tolerance}
-        own |= {"landmark_deviation": self.landmark_deviation}
+        own |= {"landmark_deviation": self.landmark_deviation, "regions": match_regions(scan, mesh)}
         control = mesh.control(weights=self.scheme.weights)
         return fit(self.scheme, self.topology(mesh), control, scan, **(own | options))
 

@@ -9,6 +9,8 @@ from scipy.spatial import KDTree
 from jaxsubdiv import RefinedSurface, SurfacePoint
 from jaxsubdiv.half_edges import half_edges
 
+from .regions import Choice
+
 _GROUP = 4  # triangles that stand in the tree as one: refining replaces a face by four, whose rows follow each other
 _LARGE, _MOST_PARTS = 1.5, 24  # times the usual size: larger triangles stand in the tree in parts, to so many a side
 _SAMPLE = 256  # points that tell how far the others will be
@@ -42,7 +44,9 @@ class _Groups(NamedTuple):
     triangles: Int[np.ndarray, "4 g"]
 
 
-def closest_points(surface: RefinedSurface, points: Float[Array | np.ndarray, "p 3"]) -> SurfacePoint:
+def closest_points(
+    surface: RefinedSurface, points: Float[Array | np.ndarray, "p 3"], choice: Choice | None = None
+) -> SurfacePoint:
     """Closest surface point of every point: the face and where in it, not the nearest vertex.
 
     Triangles are searched exactly: a triangle near the point bounds its distance, and every triangle that may lie
@@ -53,18 +57,39 @@ def closest_points(surface: RefinedSurface, points: Float[Array | np.ndarray, "p
     Args:
         surface: values on the host or on the device.
         points: positions in the unit of the surface.
+        choice: the faces that each point may lie on; default: all.
     """
     vertices = np.asarray(surface.vertices, np.float64)
     points = np.asarray(points, np.float64)
     by_coordinate = np.ascontiguousarray(vertices.T)
     a, b, c = (np.take(by_coordinate, column, axis=1) for column in np.asarray(surface.triangles()).T)
-    triangle, uv = _nearest_triangle(_Triangles(a, b - a, c - a), points)
+    triangles = _Triangles(a, b - a, c - a)
+    if choice is None:
+        triangle, uv = _nearest_triangle(triangles, points)
+    else:
+        triangle, uv = _nearest_chosen(triangles, points, *triangle_choice(choice, surface))
     face, uv = to_faces(len(surface.faces[3]), triangle, uv)
     in_quad = np.flatnonzero(face >= len(surface.faces[3]))
     if len(in_quad):
         quad = np.asarray(surface.faces[4])[face[in_quad] - len(surface.faces[3])]
         uv[in_quad] = polish(vertices[quad], points[in_quad], uv[in_quad])
     return SurfacePoint(face.astype(np.int32), uv.astype(surface.vertices.dtype))
+
+
+def triangle_choice(
+    choice: Choice, surface: RefinedSurface, xp: Any = np
+) -> tuple[Int[AnyArray, "p"], Bool[AnyArray, "k t"]]:
+    """The row of each point, and in it the triangles of the triangulated view that it may lie on: in the last, all.
+
+    Raises:
+        ValueError: the choice is of another number of faces.
+    """
+    if choice.faces.shape[1] != surface.n_faces:
+        raise ValueError(f"the choice is among {choice.faces.shape[1]} faces; the surface has {surface.n_faces}.")
+    n = surface.faces[3].shape[0]
+    chosen = xp.concatenate([choice.faces, xp.ones_like(choice.faces[:1])])
+    rows = xp.where(choice.of_points < 0, len(choice.faces), choice.of_points)
+    return rows, xp.concatenate([chosen[:, :n], xp.repeat(chosen[:, n:], 2, axis=1)], axis=1)
 
 
 def boundary_vertices(surface: RefinedSurface) -> Bool[np.ndarray, "v"]:
@@ -102,6 +127,24 @@ def _nearest_triangle(
         search.look(everyone, search.usual_distance())
         search.look_around(everyone[~search.found])
     return search.nearest, search.uv
+
+
+def _nearest_chosen(
+    triangles: _Triangles,
+    points: Float[np.ndarray, "p 3"],
+    of_points: Int[np.ndarray, "p"],
+    chosen: Bool[np.ndarray, "k t"],
+) -> tuple[Int[np.ndarray, "p"], Float[np.ndarray, "p 2"]]:
+    """The nearest of the triangles that are chosen for each point: a search for each row of `chosen`."""
+    nearest, uv = np.zeros(len(points), np.int64), np.zeros((len(points), 2))
+    for row in np.unique(of_points):
+        own, which = np.flatnonzero(of_points == row), np.flatnonzero(chosen[row])
+        if not len(which):
+            raise ValueError(f"there is no face that point {own[0]} may lie on.")
+        part = _Triangles(*(rows[:, which] for rows in triangles))
+        found, uv[own] = _nearest_triangle(part, points[own])
+        nearest[own] = which[found]
+    return nearest, uv
 
 
 class _Search:

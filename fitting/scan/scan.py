@@ -4,6 +4,7 @@ import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -47,6 +48,13 @@ def _optional_whole(value: object) -> Array | None:
     return jnp.asarray(values, jnp.int32)
 
 
+def _optional_regions(value: Any) -> js.Regions | None:
+    try:
+        return js.as_regions(value)
+    except ValueError as error:
+        raise ScanError(f"`regions`: {error}") from None
+
+
 def _optional_faces(value: object) -> np.ndarray | None:
     faces = None if value is None else np.asarray(value)
     if faces is None or not faces.size:
@@ -82,6 +90,8 @@ class Scan(eqx.Module):
         view: of a scan that was seen in an image `[4, 4]`, takes positions to the unit cube that the image shows. A
             control mesh made from the scan ends there, as an open surface: what lies beyond was not seen. A saved fit
             does not keep it.
+        regions: the part of the anatomy that each point was labelled as, or None: `jaxsubdiv.Regions`, or a name each,
+            empty where a point has none. A fit to a template with groups of faces pairs each point with its own.
 
     Raises:
         ScanError: there is no point, a value is not finite, a weight is negative, a deviation is not positive, a
@@ -97,6 +107,7 @@ class Scan(eqx.Module):
     frame: Frame | None = eqx.field(static=True, default=None)
     outlined: bool = eqx.field(static=True, default=False)
     view: Float[np.ndarray, "4 4"] | None = None
+    regions: js.Regions | None = eqx.field(converter=_optional_regions, default=None)
 
     def __check_init__(self):
         if self.points.ndim != 2 or self.points.shape[-1] != 3 or len(self.points) == 0:
@@ -115,6 +126,8 @@ class Scan(eqx.Module):
             finite = np.isfinite(np.asarray(values)).reshape(len(values), -1).all(axis=1)
             if not finite.all():
                 raise ScanError(f"`{name}` are not finite in rows {name_rows(np.flatnonzero(~finite))}. Drop the rows.")
+        if self.regions is not None and len(self.regions) != len(self.points):
+            raise ScanError(f"there are {len(self.regions)} `regions` for {len(self.points)} points. Give one each.")
         if self.faces is not None and not (0 <= self.faces.min() and self.faces.max() < len(self.points)):
             raise ScanError(f"`faces` name points that there are not: the scan has {len(self.points)}.")
         if self.weights is not None:
@@ -158,7 +171,7 @@ class Scan(eqx.Module):
 
     def rows(self, chosen: Bool[np.ndarray, "p"] | Int[np.ndarray, "q"]) -> "Scan":
         """Some of the points, with all that is known of each."""
-        of_all = {"faces", "frame", "outlined", "view"}
+        of_all = {"faces", "frame", "outlined", "view", "regions"}
         own = {name: value for name, value in vars(self).items() if name not in of_all and value is not None}
         faces = None
         if self.faces is not None:
@@ -166,11 +179,15 @@ class Scan(eqx.Module):
             new[chosen] = np.arange(len(new[chosen]))
             faces = new[self.faces][(new[self.faces] >= 0).all(axis=1)]
         return Scan(
-            **{name: value[chosen] for name, value in own.items()}, faces=faces, frame=self.frame, view=self.view
+            **{name: value[chosen] for name, value in own.items()},
+            faces=faces,
+            frame=self.frame,
+            view=self.view,
+            regions=None if self.regions is None else self.regions.take(chosen),
         )
 
     def without_slices(self) -> "Scan":
-        """The same points, each for itself."""
+        """The same points, each for itself, without their labels."""
         return Scan(self.points, self.normals, self.weights, self.deviations)
 
     def relative_deviations(self) -> Float[Array, "p"]:
@@ -186,7 +203,7 @@ def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[st
     Faces of a mesh file are kept, see `Scan.faces`. A column `slice` of a CSV file, or another table with a header row,
     numbers the slices, and `frameID` does so in guide points of biv-me (`GPFile_000.txt`). Points that are not finite
     are dropped, with a warning; see `jaxsubdiv.read_points` for all that a file may hold. The frame is what the file
-    says, see `jaxsubdiv.read_frame`.
+    says, see `jaxsubdiv.read_frame`. A column `label` or `contour` names the regions, see `Scan.regions`.
 
     Args:
         path: the file.
@@ -202,22 +219,24 @@ def read_scan(path: str | Path, *, scale: float = 1.0, labels: str | Sequence[st
     cloud, columns = js.read_labelled_points(path, (*_LABELS, _SLICE), scale=scale)
     slices = None if _SLICE not in columns else _numbers(path, columns[_SLICE])
     words = [labels] if isinstance(labels, str) else list(labels)
-    if not words:
-        return _scan(path, *cloud, None, slices, _faces_between(path, cloud.points, scale), js.read_frame(path))
     of_rows = next((columns[name] for name in _LABELS if name in columns), [])
+    if not words:
+        faces = _faces_between(path, cloud.points, scale)
+        return _scan(path, *cloud, None, slices, faces, js.read_frame(path), regions=of_rows or None)
     chosen = np.array([any(word.casefold() in one.casefold() for word in words) for one in of_rows], bool)
     if not chosen.any():
         there = ", ".join(sorted(set(of_rows))) or "no column `label` or `contour`"
         wanted = " or ".join(f"'{word}'" for word in words)
         raise ScanError(f"{path.name}: no row has a label that holds {wanted}. It has: {there}.")
     kept = (None if rows is None else rows[chosen] for rows in (*cloud, None, slices))
-    return _scan(path, *kept, None, js.read_frame(path))
+    own = [one for one, is_kept in zip(of_rows, chosen, strict=True) if is_kept]
+    return _scan(path, *kept, None, js.read_frame(path), regions=own)
 
 
-def _scan(path: Path, *parts: np.ndarray | Frame | None) -> Scan:
+def _scan(path: Path, *parts: np.ndarray | Frame | None, regions: list[str] | None = None) -> Scan:
     try:
         with np.errstate(over="ignore"):  # what passes single precision is not finite, and told as such
-            return Scan(*parts)  # pyright: ignore[reportArgumentType]
+            return Scan(*parts, regions=regions)  # pyright: ignore[reportArgumentType]
     except ScanError as error:
         raise ScanError(f"{path.name}: {error}") from None
 

@@ -17,7 +17,8 @@ from jaxtyping import Array, Bool, Float, Int
 import jaxsubdiv as js
 from jaxsubdiv.linalg import cross, dot, norm, unit
 
-from .closest_points import polish, to_faces, triangle_distance
+from .closest_points import polish, to_faces, triangle_choice, triangle_distance
+from .regions import Choice
 
 _ROUNDING = 16.0  # times the precision of the numbers: by so much a bound is too large at most
 
@@ -46,7 +47,12 @@ class _Found(NamedTuple):
 
 @partial(jax.jit, static_argnames=("memory", "patch"))
 def search_closest(
-    surface: js.RefinedSurface, points: Float[Array, "p 3"], *, memory: int = 1 << 25, patch: int = 16
+    surface: js.RefinedSurface,
+    points: Float[Array, "p 3"],
+    choice: Choice | None = None,
+    *,
+    memory: int = 1 << 25,
+    patch: int = 16,
 ) -> js.SurfacePoint:
     """Closest surface point of every point, as `closest_points` finds it on the host, under `jit` and `vmap`.
 
@@ -59,6 +65,7 @@ def search_closest(
     Args:
         surface: triangles, quads or both.
         points: positions in the unit of the surface. One that is not finite gets some place of the surface.
+        choice: the faces that each point may lie on; default: all.
         memory: about how many bytes may be used at once, beside the surface: points go in blocks that fit.
         patch: triangles a patch, best a power of four.
     """
@@ -69,7 +76,15 @@ def search_closest(
     blocks = max(-(-n * a_point // memory), 1)
     size = -(-n // blocks)
     padded = jnp.pad(points, ((0, blocks * size - n), (0, 0)), mode="edge").reshape(blocks, size, 3)
-    triangle, uv = lax.map(jax.vmap(lambda point: _search(patches, point)), padded)
+    if choice is None:
+        triangle, uv = lax.map(jax.vmap(lambda point: _search(patches, point)), padded)
+    else:
+        rows, chosen = triangle_choice(choice, surface, jnp)
+        chosen = jnp.pad(chosen, ((0, 0), (0, len(patches.middle) * patch - chosen.shape[1])), mode="edge")
+        chosen = chosen.reshape(len(chosen), -1, patch)
+        rows = jnp.pad(rows, (0, blocks * size - n), mode="edge").reshape(blocks, size)
+        of_one = jax.vmap(lambda point, row: _search(patches, point, chosen[row]))
+        triangle, uv = lax.map(lambda some: of_one(*some), (padded, rows))
     triangle, uv = triangle.reshape(-1)[:n], uv.reshape(-1, 2)[:n]
     n_triangles, quads = surface.faces[3].shape[0], surface.faces[4]
     face, uv = to_faces(n_triangles, triangle, uv, jnp)
@@ -98,10 +113,14 @@ def _patches(vertices: Float[Array, "v 3"], triangles: Int[Array, "s 3"], patch:
     return _Patches(edges.swapaxes(1, 2), middle, axis, (high - low) / 2, beside.max(axis=1, keepdims=True))
 
 
-def _search(patches: _Patches, point: Float[Array, "3"]) -> tuple[Int[Array, ""], Float[Array, "2"]]:
-    """The closest triangle of a point, of all patches, and the place in it."""
+def _search(
+    patches: _Patches, point: Float[Array, "3"], chosen: Bool[Array, "k m"] | None = None
+) -> tuple[Int[Array, ""], Float[Array, "2"]]:
+    """The closest triangle of a point, of all patches or of those chosen in them, and the place in it."""
     size, number = patches.triangles.shape[-1], (1 << (len(patches.middle) - 1).bit_length()) - 1
     keys, most = _keys(patches, point, number)
+    if chosen is not None:
+        keys = jnp.where(chosen.any(axis=1), keys, most)
 
     def closer(found: _Found) -> Bool[Array, ""]:
         return lax.bitcast_convert_type(found.key & ~number, point.dtype) < found.squared
@@ -110,6 +129,8 @@ def _search(patches: _Patches, point: Float[Array, "3"]) -> tuple[Int[Array, ""]
         patch = (found.key & number).astype(jnp.int32)
         a, ab, ac = jnp.split(patches.triangles[patch], 3)
         squared, u, v = triangle_distance(a, ab, ac, point[:, None], jnp)
+        if chosen is not None:
+            squared = jnp.where(chosen[patch], squared, jnp.inf)
         best = jnp.argmin(squared).astype(jnp.int32)
         nearer = squared[best] < found.squared
         return _Found(

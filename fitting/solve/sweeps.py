@@ -162,7 +162,7 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
         surface = js.RefinedSurface(state.vertices, state.normals, model.topology.faces)
         held, points = hold_priors(model, y, surface, state.strengths.values, scene)
         search = closest_points if self._on_host else search_closest
-        at = search(surface, points)
+        at = search(surface, points, scene.choice)
         k, least = state.sweep, LEAST_NOISE * model.edge
         fallen = jnp.maximum(jnp.asarray(state.widest) * 0.5 ** jnp.asarray(k, model.edge.dtype), least)
         floor = jnp.where(jnp.asarray(k) > 0, fallen, least)
@@ -310,7 +310,7 @@ def subject_residual(y: Variables, subject: Subject) -> dict[str, Float[Array, "
     model, scene = subject
     surface, strengths = model.refine(y), first_strengths(model)
     held, points = hold_priors(model, y, surface, strengths.values, scene)
-    at = search_closest(surface, points)
+    at = search_closest(surface, points, scene.choice)
     look = measure(surface, scene, points, at, model.edge, LEAST_NOISE * model.edge, geman_mcclure())
     return Residual(model)(y, hold_sweep(model, y, scene, look, at, strengths, held, jnp))
 
@@ -349,7 +349,7 @@ def measure_look(
     held, points = hold_priors(model, y, surface, strengths, scene)
     covered = held["rim"].covered if "rim" in held else None
     edge = js.edge_length(model.topology, y.control.vertices)
-    at = closest_points(surface, points)
+    at = closest_points(surface, points, scene.choice)
     look = measure(surface, scene, points, at, edge, LEAST_NOISE * edge, loss, covered)
     return jax.tree.map(np.asarray, look)
 

@@ -612,7 +612,7 @@ def mirror_image(mesh: js.ControlMesh, landmarks: Landmarks | None = None) -> tu
     faces = {size: rows[:, ::-1] for size, rows in mesh.faces.items()}
     if landmarks is not None and np.ndim(landmarks.on_mesh) == 2:
         landmarks = landmarks._replace(on_mesh=np.asarray(landmarks.on_mesh, np.float64) * flip + about)
-    return js.ControlMesh(mesh.vertices * flip + about, faces, normals), landmarks
+    return js.ControlMesh(mesh.vertices * flip + about, faces, normals, regions=mesh.regions), landmarks
 
 
 def put(mesh: js.ControlMesh, transform: Float[np.ndarray, "4 4"]) -> js.ControlMesh:
@@ -622,4 +622,4 @@ def put(mesh: js.ControlMesh, transform: Float[np.ndarray, "4 4"]) -> js.Control
         normals = normals @ np.linalg.inv(pose.linear)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
-    return js.ControlMesh(pose(mesh.vertices), mesh.faces, normals)
+    return js.ControlMesh(pose(mesh.vertices), mesh.faces, normals, regions=mesh.regions)

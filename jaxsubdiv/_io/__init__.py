@@ -98,7 +98,8 @@ def read_mesh(path: str | os.PathLike[str], *, scale: float | int = 1.0, check: 
 
     Vertices, and the faces of one size, keep their order; unused vertices stay. Known suffixes, in any case:
 
-    - `.obj`: texture coordinates, groups and materials are left out. Where the corners at a vertex name several
+    - `.obj`: the names of its groups (`g`) are the `regions` of the faces; texture coordinates and materials are left
+      out. Where the corners at a vertex name several
       different normals, the vertex gets their unit mean, with a warning. Normals that no face names are taken when
       there is one a vertex. Surfaces of the MNI tools as text have this suffix too, and are read.
     - `.ply`: text, or binary of either byte order; other properties are left out.
@@ -139,7 +140,7 @@ def read_mesh(path: str | os.PathLike[str], *, scale: float | int = 1.0, check: 
     normals = None if normals is None else _numbers(path.name, "normals", normals, (len(vertices), 3))
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # areas of faces as large as numbers can be
-            return ControlMesh(_scaled(vertices, scale), contents.faces, normals, check=check)
+            return ControlMesh(_scaled(vertices, scale), contents.faces, normals, check=check, regions=contents.regions)
     except MeshError as error:
         mend = " Read it with check=False to get there." if "repaired()" in str(error) else ""
         raise MeshError(f"{path.name}: {error}{mend}") from None
@@ -249,8 +250,9 @@ def write_mesh(
 ) -> None:
     """Write a mesh to a file of the format that the suffix names, so that it reads back the same bit for bit.
 
-    Suffixes: `.obj`, `.ply`, `.off`, `.vtp`, `.vtk`, `.npz`; and, with less in them, where quads are split with a
-    warning, and another says by how much coordinates are rounded to single precision:
+    Suffixes: `.obj`, which alone keeps the regions of the faces, as groups, `.ply`, `.off`, `.vtp`, `.vtk`, `.npz`;
+    and, with less in them, where quads are split with a warning, and another says by how much coordinates are rounded
+    to single precision:
 
     - `.stl`: no normals, and no vertices that no face uses; not rounded.
     - `.gii`: GIfTI, as Connectome Workbench opens it: no normals, which it allows no room, and vertex data in a file of
@@ -386,7 +388,7 @@ def _contents(path: Path, mesh: Surface) -> Contents:
             f"{path.name}: nothing is written, since the mesh has no faces or faces with vertex indices outside of its "
             f"{len(vertices)} vertices."
         )
-    return Contents(vertices, faces, normals)
+    return Contents(vertices, faces, normals, regions=getattr(mesh, "regions", None))
 
 
 def _vertex_data(data: Mapping[str, ArrayLike], n_vertices: int) -> VertexData:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Shaped
 
 from .. import notices
+from .._regions import Regions
 from ..errors import MeshError, name_rows
 from ..frames import Frame
 
@@ -28,6 +29,8 @@ class Contents(NamedTuple):
     """What the axes are, where that is known."""
     usual_unit: tuple[str, float] | None = None
     """The unit that programs of the format write, and the scale that takes it to mm; None where it says nothing."""
+    regions: Regions | None = None
+    """Of the faces, triangles first."""
 
 
 VertexData = Mapping[str, Shaped[np.ndarray, "v"]]

@@ -10,6 +10,7 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .._regions import Regions, as_regions
 from ..errors import MeshError, name_rows
 from ..tables import decode
 from . import _mni
@@ -43,7 +44,7 @@ class _Corners(NamedTuple):
 
 
 def read(path: Path) -> Contents:
-    """`v`, `vn` and `f`; every other statement is left out, and so are the numbers after `v x y z`."""
+    """`v`, `vn`, `f` and `g`; every other statement is left out, and so are the numbers after `v x y z`."""
     data = path.read_bytes()
     if _mni.is_mni(data):
         return _mni.read(path, data)
@@ -60,7 +61,7 @@ def read(path: Path) -> Contents:
         )
     vertex, per_vertex = _indices(path, lines, f, corners, normals, len(vertices))
     faces = by_size(vertex, np.cumsum(corners.sizes) - corners.sizes, corners.sizes)
-    return Contents(vertices, faces, per_vertex)
+    return Contents(vertices, faces, per_vertex, regions=_groups(lines, f, corners.sizes))
 
 
 def read_points(path: Path) -> Contents:
@@ -103,17 +104,46 @@ def _indices(
     return vertex, _per_vertex(path, vertex, named, normal, normals, n_vertices)
 
 
+def _groups(lines: _Lines, f: Int[np.ndarray, "f"], sizes: Int[np.ndarray, "f"]) -> Regions | None:
+    """The group that each face is in, triangles first; None where no group has a name."""
+    at = lines.of("g")
+    words = np.array(["", *(" ".join(lines.text[i].split()[1:]) for i in at)])
+    if not any(words):
+        return None
+    of_faces = words[np.searchsorted(at, f)]
+    found = as_regions([str(word) for size in (3, 4) for word in of_faces[sizes == size]])
+    return found if found is not None and found.names else None
+
+
 def write(path: Path, contents: Contents, data: VertexData) -> None:
-    """`v`, `vn` where there are normals, and `f` with equal indices for both."""
+    """`v`, `vn` where there are normals, `f` with equal indices for both, and `g` where there are regions."""
     one_based = [faces + 1 for faces in (contents.faces or {}).values()]
     text = f"# {space_words(contents.frame)}\n" if contents.frame else ""
     text += number_lines(contents.vertices, "v ")
     if contents.normals is None:
-        text += face_lines(one_based, "f ")
+        faces = face_lines(one_based, "f ")
     else:
         text += number_lines(contents.normals, "vn ")
-        text += "".join(f"f {' '.join(f'{i}//{i}' for i in face)}\n" for block in one_based for face in block.tolist())
-    path.write_bytes(text.encode())
+        faces = "".join(f"f {' '.join(f'{i}//{i}' for i in face)}\n" for block in one_based for face in block.tolist())
+    if contents.regions is not None:
+        faces = _in_groups(path, faces, contents.regions)
+    path.write_bytes((text + faces).encode())
+
+
+def _in_groups(path: Path, faces: str, regions: Regions) -> str:
+    """The lines of the faces, with the name of their group before the first of each run."""
+    for name in regions.names:
+        if name != " ".join(name.split()) or "#" in name or name.endswith("\\"):
+            raise MeshError(
+                f"{path.name}: OBJ holds no group of the name {name!r}. Rename the region, or leave it out."
+            )
+    rows, lines = regions.rows.tolist(), faces.splitlines(keepends=True)
+    before = [-1, *rows[:-1]]
+    headings = [
+        "" if row == last else f"g {regions.names[row]}\n" if row >= 0 else "g\n"
+        for row, last in zip(rows, before, strict=True)
+    ]
+    return "".join(heading + line for heading, line in zip(headings, lines, strict=True))
 
 
 def _logical_lines(text: str) -> _Lines:
