@@ -210,7 +210,7 @@ def test_fit_of_version_3_has_the_report_that_it_had(name, tmp_path):
 
 def old_report(found: fitting.FitResult) -> dict:
     """What reports had at that time."""
-    newer = ("trusted", "warnings", "pose", "frame")
+    newer = ("trusted", "warnings", "pose", "frame", "regions")
     return {name: value for name, value in found.report(uncertainty=True).as_dict().items() if name not in newer}
 
 
