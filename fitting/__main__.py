@@ -144,6 +144,8 @@ def _main(arguments: Sequence[str] | None) -> int:
 
 def _sources(options: argparse.Namespace) -> list[_Source]:
     """Every scan of the files and folders that were named, one a label where all are asked for."""
+    if options.label is not None and options.above is not None:
+        raise ValueError("give --label, which is of a label map, or --above, of a grey image, not both.")
     sources: list[_Source] = []
     for path in find_scans([Path(scan) for scan in options.scans]):
         if not is_image(path):
@@ -569,7 +571,12 @@ def _parser() -> argparse.ArgumentParser:
         "stopped by Ctrl-C.",
     )
     add = parser.add_argument
-    add("scans", nargs="*", metavar="SCAN", help="points or meshes, or folders of them: .ply .xyz .csv .txt .npz .vtp")
+    add(
+        "scans",
+        nargs="*",
+        metavar="SCAN",
+        help="points, meshes, label maps or images, or folders of them: .ply .xyz .csv .vtp .nii.gz .nrrd",
+    )
     add("--control", metavar="MESH", help="template of triangles and quads to start from; default: made from the scan")
     add("-o", "--output", metavar="OUT", help="folder for the results (default: fit_ and the scan's file, or fits)")
     add("--faces", type=int, help=f"of the control mesh, where it is made (default: {Recipe.faces})")

@@ -5,7 +5,9 @@ import re
 import struct
 import subprocess
 import sys
+import time
 import warnings
+import zlib
 from pathlib import Path
 
 import highdicom
@@ -22,6 +24,7 @@ from scipy.spatial.transform import Rotation
 import fitting
 import jaxsubdiv as js
 from fitting.__main__ import main as fit_command
+from fitting.image.volume import mask_of
 from jaxsubdiv.frames import in_frame
 
 SHAPE, SPACING = (9, 8, 7), np.array([0.5, 1.25, 3.0])
@@ -114,9 +117,12 @@ def test_a_nifti_file_in_metres_is_read_in_mm(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:The string")  # what highdicom thinks of the patient's name
-def test_a_dicom_segmentation(tmp_path):
-    mask = np.zeros((6, 20, 16, 2), np.uint8)
-    mask[2:4, 5:15, 4:12, 0], mask[3, 7, 3, 1] = 1, 1
+@pytest.mark.parametrize(("overlap", "kind"), [(False, "BINARY"), (True, "BINARY"), (False, "FRACTIONAL")])
+def test_a_dicom_segmentation(tmp_path, overlap, kind):
+    mask = np.zeros((6, 20, 16, 2), np.uint8 if kind == "BINARY" else np.float32)
+    mask[2:4, 5:15, 4:12, 0], mask[3, 7, 5 if overlap else 3, 1] = 1, 1
+    if kind == "FRACTIONAL":
+        mask[2, 0, 0, 0], mask[2, 0, 1, 0] = 0.2, 0.6
     segments = [
         highdicom.seg.SegmentDescription(
             n, name, codes.SCT.Organ, codes.SCT.Liver, highdicom.seg.SegmentAlgorithmTypeValues.MANUAL
@@ -125,16 +131,20 @@ def test_a_dicom_segmentation(tmp_path):
     ]
     uid = pydicom.uid.generate_uid
     made = highdicom.seg.Segmentation(
-        dicom_slices(6, 20, 16), mask, "BINARY", segments, uid(), 1, uid(), 1, "maker", "model", "1", "0"
+        dicom_slices(6, 20, 16), mask, kind, segments, uid(), 1, uid(), 1, "maker", "model", "1", "0"
     )
     made.save_as(tmp_path / "a.dcm")
 
     volume = fitting.read_volume(tmp_path / "a.dcm")
 
     assert volume.frame == "LPS"
-    assert [(one.label.name, one.voxels) for one in fitting.find_labels(volume)] == [("liver", 160), ("vessel", 1)]
-    index = np.argwhere(volume.layers[1]).astype(float)
-    np.testing.assert_allclose(volume.positions(index), [[10 + 3 * 1.5, -20 + 7 * 2.0, 30 + 3 * 3.0]])
+    assert len(volume.layers) == (1 if kind == "BINARY" and not overlap else 2)
+    assert all(layer.itemsize == 1 for layer in volume.layers)
+    liver = 160 + (kind == "FRACTIONAL")
+    assert [(one.label.name, one.voxels) for one in fitting.find_labels(volume)] == [("liver", liver), ("vessel", 1)]
+    index = np.argwhere(mask_of(volume, fitting.choose_label(volume, "vessel"))).astype(float)
+    column = 5 if overlap else 3
+    np.testing.assert_allclose(volume.positions(index), [[10 + column * 1.5, -20 + 7 * 2.0, 30 + 3 * 3.0]])
     assert volume.layers[0].shape == (4, 20, 16)  # empty slices are not stored
 
 
@@ -309,6 +319,25 @@ def test_slices_show_the_label_where_it_is_and_name_their_sides(frame):
         assert top in "SA" and left in "RAI"
 
 
+def test_every_axis_has_sides_of_its_own():
+    affine = np.eye(4)
+    affine[:3, :3] = Rotation.from_euler("z", 45, degrees=True).as_matrix()
+    affine[:2, :2] += [[0.01, 0], [0, -0.01]]  # both axes are nearer to x
+    volume = fitting.Volume((np.ones((9, 9, 9), np.uint8),), affine, "RAS")
+    corners = volume.positions(np.array([[2.0, 2, 2], [6, 6, 6]]))
+    for one in fitting.cut_slices(volume, corners, label=fitting.Label(1, "")):
+        assert len(set(one.sides)) == 4
+
+
+def test_an_even_part_of_many_points_is_drawn():
+    volume, _ = ellipsoid(2.0)
+    whole = np.asarray(fitting.scan_of_label(volume, fitting.Label(1, "")).points)
+    part = np.asarray(fitting.scan_of_label(volume, fitting.Label(1, ""), most_points=500).points)
+    assert len(part) == 500 and len(np.unique(part, axis=0)) == 500
+    assert (np.abs(whole[None] - part[:, None]).max(axis=-1).min(axis=1) < 1e-6).all()
+    np.testing.assert_allclose(part.mean(axis=0), whole.mean(axis=0), atol=2)
+
+
 def test_contours_lie_on_the_surface():
     volume, _ = ellipsoid(2.0)
     mesh = fitting.control_mesh(fitting.scan_of_label(volume, fitting.Label(1, "")), faces=100)
@@ -349,10 +378,16 @@ def test_the_command_fits_every_label_into_a_folder_of_its_own(two_labels, tmp_p
     capsys.readouterr()
 
 
+def test_labels_and_grey_values_at_once_are_refused_before_any_fit(two_labels, tmp_path, capsys):
+    options = ["--label", "all", "--above", "3", "-o", str(tmp_path / "out")]
+    assert fit_command([str(two_labels), *options]) == 2
+    assert "not both" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ([], r"seg.nii.gz: it has 2 labels; choose by --label .* 1 \(.* ml\), 5 right/kidney \(.* ml\)"),
+        ([], r"seg.nii.gz: it has 2 labels; choose one by --label .* 1 \(.* ml\), 5 right/kidney \(.* ml\)"),
         (["--label", "liver"], "no voxel has the label 'liver'"),
         (["--label", "1", "--above", "3"], "not both"),
         (["--labels", "liver"], "is for tables"),
@@ -376,14 +411,14 @@ def damaged(path: Path, head: bytes) -> None:
     path.write_bytes(gzip.compress(head) if path.suffix == ".gz" else head)
 
 
-NIFTI = struct.pack("<i36x8h14xhh36xf", 348, 3, 2000, 2000, 2000, 1, 1, 1, 1, 2, 8, 352.0).ljust(352, b"\0")
+NIFTI = struct.pack("<i36x8h14xhh36xf", 348, 3, 2000, 2000, 2000, 1, 1, 1, 1, 2, 8, 352.0).ljust(344, b"\0") + b"n+1\0"
 
 
 @pytest.mark.parametrize(
     ("name", "content", "text"),
     [
         ("a.nii", b"not an image at all", "does not begin as a NIfTI"),
-        ("a.nii", NIFTI, "8,000,000,000 bytes of voxels, and the file has 352"),
+        ("a.nii", NIFTI, "8,000,000,000 bytes of voxels, and the file has 348"),
         ("a.nii.gz", NIFTI, "8,000,000,000 bytes of voxels, and"),
         ("a.nii.gz", b"\x1f\x8b\x08garbage", "does not begin|damaged"),
         ("a.nrrd", b"NRRD0004\ntype: short\ndimension: 3\n", "does not begin as a NRRD"),
@@ -428,6 +463,172 @@ def test_damaged_images_are_refused_by_name(tmp_path, name, content, text):
             fitting.read_volume(tmp_path / name)
 
 
+def nifti(path: Path, values: np.ndarray, axes: np.ndarray | None = None, extension: tuple[int, bytes] | None = None):
+    """A NIfTI file as it should be, to be damaged."""
+    image = nibabel.Nifti2Image(values, np.eye(4) if axes is None else axes)
+    if extension is not None:
+        image.header.extensions.append(nibabel.nifti1.Nifti1Extension(*extension))
+    nibabel.save(image, path)
+    return image
+
+
+def nrrd_file(path: Path, values: np.ndarray, changes: dict[str, str], encoding: str = "raw") -> None:
+    """An NRRD file, and then other lines in its header."""
+    header = {"space": "LPS", "space directions": np.eye(3), "space origin": np.zeros(3), "encoding": encoding}
+    nrrd.write(str(path), values, header)
+    head, voxels = path.read_bytes().split(b"\n\n", 1)
+    lines = [line for line in head.decode().split("\n") if line.split(":")[0] not in changes]
+    lines += [f"{name}: {value}" for name, value in changes.items() if value]
+    path.write_bytes("\n".join(lines).encode() + b"\n\n" + voxels)
+
+
+def test_a_suffix_must_say_whether_a_nifti_file_is_packed(tmp_path):
+    nifti(tmp_path / "a.nii", np.ones(SHAPE, np.uint8))
+    nifti(tmp_path / "b.nii.gz", np.ones(SHAPE, np.uint8))
+    for old, new, text in (("a.nii", "a.nii.gz", "not packed .*to .nii"), ("b.nii.gz", "b.nii", "packed .*to .nii.gz")):
+        (tmp_path / old).rename(tmp_path / new)
+        with pytest.raises(fitting.ScanError, match=f"^{new}: it is {text}"):
+            fitting.read_volume(tmp_path / new)
+
+
+def test_a_header_of_a_pair_is_refused(tmp_path):
+    (tmp_path / "a.nii").write_bytes(NIFTI.replace(b"n+1", b"ni1") + bytes(8))
+    with pytest.raises(fitting.ScanError, match=r"^a.nii: .*another file with the voxels, .img"):
+        fitting.read_volume(tmp_path / "a.nii")
+
+
+@pytest.mark.parametrize("values", [np.zeros(SHAPE, np.complex64), np.zeros(SHAPE, [(n, "u1") for n in "RGB"])])
+def test_colours_and_complex_numbers_are_refused(tmp_path, values):
+    nifti(tmp_path / "a.nii", values)
+    with pytest.raises(fitting.ScanError, match=r"^a.nii: its voxels are of the type \d+; .*one number each"):
+        fitting.read_volume(tmp_path / "a.nii")
+
+
+def test_the_room_for_voxels_is_that_of_their_type(tmp_path):
+    head = bytearray(NIFTI + bytes(4))
+    struct.pack_into("<3h", head, 42, 10, 10, 4)
+    struct.pack_into("<2h", head, 70, 64, 1)  # numbers of 64 bits, which the next field says are of one
+    (tmp_path / "a.nii").write_bytes(head)
+    with pytest.raises(fitting.ScanError, match="3,200 bytes of voxels, and the file has 352"):
+        fitting.read_volume(tmp_path / "a.nii")
+
+
+@pytest.mark.parametrize("value", [np.inf, np.nan, 1e300, 0.5])
+def test_numbers_that_are_no_labels_are_refused_as_such(tmp_path, value):
+    values = np.zeros(SHAPE)
+    values[2:5, 2:5, 2:5] = value
+    nifti(tmp_path / "a.nii", values)
+    volume = fitting.read_volume(tmp_path / "a.nii")
+    with pytest.raises(fitting.ScanError, match="it is an image and no label map: give --above"):
+        fitting.find_labels(volume)
+    if value != 0.5:
+        with pytest.raises(fitting.ScanError, match="27 voxels of the image are not finite, or far too large"):
+            fitting.scan_above(volume, 0.1)
+
+
+def test_few_large_values_are_labels_and_are_counted(tmp_path):
+    values = np.zeros((80, 70, 60), np.int32)  # counted in more than one part
+    values[2:5, 2:5, 2:5], values[7:70, 6, 5] = 7, 2_000_000_000
+    volume = fitting.Volume((values,), np.eye(4), None)
+    assert [(one.label.value, one.voxels) for one in fitting.find_labels(volume)] == [(7, 27), (2_000_000_000, 63)]
+
+
+@pytest.mark.parametrize("axes", [np.diag([1e200, 1, 1, 1]), np.diag([1e-9, 1, 1, 1]), np.eye(4)[[0, 1, 1, 3]]])
+def test_voxels_must_have_a_size(tmp_path, axes):
+    image = nifti(tmp_path / "a.nii", np.ones(SHAPE, np.uint8))
+    data = bytearray((tmp_path / "a.nii").read_bytes())
+    at = data.index(np.asarray(image.affine[:3], "<f8").tobytes())
+    data[at : at + 96] = np.asarray(axes[:3], "<f8").tobytes()
+    (tmp_path / "a.nii").write_bytes(data)
+    with pytest.raises(fitting.ScanError, match=r"^a.nii: its voxels have no size: the axes are "):
+        fitting.read_volume(tmp_path / "a.nii")
+
+
+@pytest.mark.parametrize(
+    "extension",
+    [(0, b"<Label " * 200_000), (0, b"<Label " + b'Key="1" ' * 200_000), (2, b"no DICOM" * 20), (32, b"<CIFTI")],
+    ids=["no end", "many keys", "DICOM", "CIFTI"],
+)
+def test_texts_in_a_header_take_no_time(tmp_path, extension):
+    nifti(tmp_path / "a.nii", np.ones(SHAPE, np.uint8), None, (0, extension[1]))
+    data = bytearray((tmp_path / "a.nii").read_bytes())
+    struct.pack_into("<i", data, 548, extension[0])
+    (tmp_path / "a.nii").write_bytes(data)
+    began = time.perf_counter()
+    try:
+        assert fitting.read_volume(tmp_path / "a.nii").labels == ()
+    except fitting.ScanError as error:
+        assert str(error).startswith("a.nii: it is no NIfTI file, or damaged: ")
+    assert time.perf_counter() - began < 5
+
+
+def test_names_are_printable(tmp_path):
+    header = {
+        "space": "LPS",
+        "space directions": np.eye(3),
+        "Segment0_Name": "K-pfchen",
+        "Segment1_Name": "a\x1b[31m",
+    }
+    path = tmp_path / "a.seg.nrrd"
+    nrrd.write(str(path), np.ones(SHAPE, np.uint8), header)
+    head, voxels = path.read_bytes().split(b"\n\n", 1)
+    path.write_bytes(re.sub(rb"K.*pfchen", "Köpfchen".encode(), head) + b"\n\n" + voxels)
+    names = [label.name for label in fitting.read_volume(path).labels]
+    assert names[0] == "Köpfchen" and names[1] == "a [31m"
+
+
+@pytest.mark.parametrize("encoding", ["raw", "gzip", "bzip2", "ascii"])
+@pytest.mark.parametrize("dtype", ["<i2", ">i2", "u1", "f4"])
+def test_every_encoding_is_read(tmp_path, encoding, dtype):
+    values = np.zeros((60, 70, 80), dtype)  # packs so well that its size looks too small for it
+    values[2:5, 3:9, 4] = 300 if dtype.endswith("i2") else 7
+    nrrd_file(tmp_path / "a.nrrd", values, {}, encoding)
+    np.testing.assert_array_equal(fitting.read_volume(tmp_path / "a.nrrd").layers[0], values)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "changes", "text"),
+    [
+        ("gzip", {"sizes": "9 8 9000000"}, "announces 1,296,000,000 bytes"),
+        ("gzip", {"sizes": "9 8 9"}, "ends after 1,008 of 1,296 bytes"),
+        ("bzip2", {"sizes": "9 8 9"}, "ends after 1,008 of 1,296 bytes"),
+        ("raw", {"sizes": "9 8 0"}, r"the sizes \[9, 8, 0\]"),
+        ("raw", {"sizes": "-9 -8 7"}, r"the sizes \[-9, -8, 7\]"),
+        ("raw", {"sizes": "9 56"}, "dimension 3"),
+        ("raw", {"encoding": "hex"}, "the encoding 'hex'"),
+        ("gzip", {"encoding": "bzip2"}, "cannot be unpacked"),
+        ("raw", {"encoding": "ascii"}, "no numbers|ends after"),
+        ("raw", {"type": "block"}, "the type 'block'"),
+        ("raw", {"endian": ""}, "'endian: None'"),
+        ("raw", {"line skip": "2000000000"}, "ends after 0"),
+        ("raw", {"byte skip": "-7"}, "skips 0 lines and -7 bytes"),
+        ("raw", {"byte skip": "2000000000"}, "ends after 0"),
+        ("gzip", {"byte skip": "-1"}, "skips 0 lines and -1 bytes"),
+    ],
+)
+def test_damaged_nrrd_files_are_refused(tmp_path, encoding, changes, text):
+    nrrd_file(tmp_path / "a.nrrd", np.arange(504, dtype=np.int16).reshape(SHAPE), changes, encoding)
+    with pytest.raises(fitting.ScanError, match=f"^a.nrrd: .*({text})"):
+        fitting.read_volume(tmp_path / "a.nrrd")
+
+
+def test_damaged_meta_images_are_refused(tmp_path):
+    head = "NDims = 3\nDimSize = 9 9 9\nElementType = MET_UCHAR\n{}ElementDataFile = {}\n"
+    packed = zlib.compress(bytes(729))
+    path = tmp_path / "a.mha"
+    path.write_bytes(head.format("CompressedData = True\nHeaderSize = -1\n", "LOCAL").encode() + packed)
+    assert fitting.read_volume(path).layers[0].shape == (9, 9, 9)
+    path.write_bytes(head.format("", "9" * 5000).encode())
+    with pytest.raises(fitting.ScanError, match=r"^a.mha: its voxels are in '9{60}', which is not beside it"):
+        fitting.read_volume(path)
+
+
+def test_images_have_one_layer():
+    grey = np.random.default_rng(0).normal(size=SHAPE)
+    with pytest.raises(fitting.ScanError, match="it has 2 layers, and an image has one"):
+        fitting.scan_above(fitting.Volume((grey, grey), np.eye(4), None), 0.0)
+
+
 def test_a_nifti_file_must_say_where_it_lies(tmp_path):
     image = nibabel.Nifti1Image(np.ones(SHAPE, np.uint8), None)
     image.header["sform_code"] = image.header["qform_code"] = 0
@@ -439,6 +640,14 @@ def test_a_nifti_file_must_say_where_it_lies(tmp_path):
 def test_series_are_refused(tmp_path):
     nibabel.save(nibabel.Nifti1Image(np.ones((3, 3, 3, 2), np.uint8), np.eye(4)), tmp_path / "a.nii")
     with pytest.raises(fitting.ScanError, match=r"\[3, 3, 3, 2\]; one volume"):
+        fitting.read_volume(tmp_path / "a.nii")
+
+
+def test_a_row_of_voxels_is_refused_before_it_is_read(tmp_path):
+    head = bytearray(NIFTI + bytes(4))
+    struct.pack_into("<3h", head, 42, 1, 1, 30_000)
+    (tmp_path / "a.nii").write_bytes(head)  # the voxels are missing
+    with pytest.raises(fitting.ScanError, match=r"^a.nii: it has \[1, 1, 30000\] voxels, which is no volume"):
         fitting.read_volume(tmp_path / "a.nii")
 
 

@@ -18,6 +18,8 @@ _MOST_FITTED, _POINTS_A_FACE, _LEAST_FACES, _MOST_FACES = 40_000, 40, 300, 2000
 _SMOOTHING = 1.5
 _REACH = 4  # standard deviations until the Gaussian is cut
 _TURNED = 0.1  # the normals' own error, in radians: no point is surer than it says
+_MOST_GREY = 1e30
+_SLABS = 8  # of an image, of which the noise is estimated
 _THIN, _MANY_THIN = 2.0, 0.02  # voxels; share of the boundary
 
 
@@ -27,6 +29,10 @@ class _Crossings(NamedTuple):
     at: Float[np.ndarray, "p 3"]
     """Indices, between whole numbers along one axis."""
     axis: Int[np.ndarray, "p"]
+    middle: Int[np.ndarray, "p 3"]
+    """Twice the index of the middle of each pair of voxels."""
+    all: bool
+    """False where these are a part of all."""
 
 
 def scan_of_label(volume: Volume, label: Label, *, most_points: int = MOST_POINTS) -> Scan:
@@ -54,7 +60,7 @@ def scan_of_label(volume: Volume, label: Label, *, most_points: int = MOST_POINT
         raise ScanError(f"no voxel has the label '{label}'.")
     low, cut = _cut_out(mask, volume)
     inside = mask[cut]
-    found = _find_crossings(inside, 0.5)
+    found = _find_crossings(inside, 0.5, most_points)
     if not len(found.at):
         raise ScanError(f"the label '{label}' fills the image: it has no boundary in it.")
     slope = _slope(inside.astype(np.float32), found.at, _widths(volume))
@@ -62,7 +68,7 @@ def scan_of_label(volume: Volume, label: Label, *, most_points: int = MOST_POINT
     _tell_thin(inside, found, outward, volume, str(label))
     across = np.einsum("px,px->p", outward, _axes(volume)[found.axis])
     deviations = volume.spacing[found.axis] * np.sqrt((across**2 + _TURNED**2) / 12)
-    return _scan(volume, low, inside, found, outward, deviations, most_points)
+    return _scan(volume, low, inside, found, outward, deviations)
 
 
 def suggest_settings(scan: Scan) -> dict[str, int]:
@@ -88,12 +94,15 @@ def scan_above(volume: Volume, threshold: float, *, most_points: int = MOST_POIN
     Raises:
         ScanError: no value, or every value, is above; a value is not finite.
     """
-    values = volume.layers[0]
-    if not np.isfinite(values).all():
-        raise ScanError(f"{np.sum(~np.isfinite(values)):,} voxels of the image are not finite.")
+    values, *others = volume.layers
+    if others:
+        raise ScanError(f"it has {len(volume.layers)} layers, and an image has one. Are they segments? Give a label.")
+    if not (values.min() > -_MOST_GREY and values.max() < _MOST_GREY):  # also of NaN
+        wrong = np.sum(~(np.abs(values) < _MOST_GREY))
+        raise ScanError(f"{wrong:,} voxels of the image are not finite, or far too large.")
     low, cut = _cut_out(values > threshold, volume)
     grey = values[cut].astype(np.float32)
-    found = _find_crossings(grey, threshold)
+    found = _find_crossings(grey, threshold, most_points)
     if not len(found.at):
         raise ScanError(f"no surface at {threshold:g}: its voxels go from {values.min():g} to {values.max():g}.")
     slope = _slope(grey, found.at, _widths(volume) / 2)
@@ -101,7 +110,7 @@ def scan_above(volume: Volume, threshold: float, *, most_points: int = MOST_POIN
     least = 0.02 * volume.spacing.min()  # linear interpolation is no better
     noise = _noise(grey)
     deviations = np.clip(noise / np.maximum(size, 1e-30), least, volume.spacing.max())
-    return _scan(volume, low, grey > threshold, found, _normals(slope, volume), deviations, most_points)
+    return _scan(volume, low, grey > threshold, found, _normals(slope, volume), deviations)
 
 
 def _scan(
@@ -111,16 +120,12 @@ def _scan(
     found: _Crossings,
     outward: Float[np.ndarray, "p 3"],
     deviations: Float[np.ndarray, "p"],
-    most_points: int,
 ) -> Scan:
     """The scan of what was found in a part of the volume that begins at `low`."""
     last = np.array(volume.layers[0].shape) - 1
     view = np.linalg.inv(volume.affine)
     view[:3] /= np.maximum(last, 1)[:, None]
     points = volume.positions(found.at + low)
-    if len(points) > most_points:
-        rows = np.sort(np.random.default_rng(0).choice(len(points), most_points, replace=False))
-        return Scan(points[rows], outward[rows], deviations=deviations[rows], frame=volume.frame, view=view)
     faces = _outline(inside, found, outward, points)
     of_all = {"faces": faces, "frame": volume.frame, "outlined": faces is not None, "view": view}
     return Scan(points, outward, deviations=deviations, **of_all)
@@ -132,10 +137,13 @@ def _outline(
     outward: Float[np.ndarray, "p 3"],
     points: Float[np.ndarray, "p 3"],
 ) -> Int[np.ndarray, "t 3"] | None:
-    """Triangles between the points, wound outwards, open where the image ends; None without the extra `mesh`.
+    """Triangles between the points, wound outwards, open where the image ends; None where these are a part of all, or
+    without the extra `mesh`.
 
     Those of marching cubes on the inside, whose vertices are the middles of the very same pairs of voxels.
     """
+    if not found.all:
+        return None
     try:
         import pyvista
     except ImportError:
@@ -143,10 +151,8 @@ def _outline(
     grid = pyvista.ImageData(dimensions=inside.shape)
     grid["inside"] = inside.astype(np.float32).ravel(order="F")
     stairs = grid.contour([0.5], "inside", method="flying_edges")
-    own = np.floor(found.at).astype(np.int64) * 2
-    own[np.arange(len(own)), found.axis] += 1
     halves = tuple(2 * np.array(inside.shape))
-    keys = np.ravel_multi_index(tuple(own.T), halves)
+    keys = np.ravel_multi_index(tuple(found.middle.T), halves)
     wanted = np.ravel_multi_index(tuple(np.round(2 * np.asarray(stairs.points)).astype(np.int64).T), halves)
     order = np.argsort(keys)
     faces = order[np.searchsorted(keys, wanted, sorter=order)][np.asarray(stairs.regular_faces)]
@@ -173,20 +179,28 @@ def _cut_out(
     return np.array([one.start for one in box]), (box[0], box[1], box[2])
 
 
-def _find_crossings(values: Shaped[np.ndarray, "i j k"], threshold: float) -> _Crossings:
+def _find_crossings(values: Shaped[np.ndarray, "i j k"], threshold: float, most: int) -> _Crossings:
+    """All of them, or an even part where there are more: of noise there may be more than voxels."""
     above = values > threshold
-    indices, axes = [], []
-    for axis in range(3):
-        first, second = (
-            tuple(slice(*ends) if n == axis else slice(None) for n in range(3)) for ends in ((None, -1), (1, None))
-        )
-        here = np.nonzero(above[first] != above[second])
+    pairs = [
+        tuple(tuple(slice(*ends) if n == axis else slice(None) for n in range(3)) for ends in ((None, -1), (1, None)))
+        for axis in range(3)
+    ]
+    changes = [above[first] != above[second] for first, second in pairs]
+    counts = [int(np.count_nonzero(change)) for change in changes]
+    n = sum(counts)
+    rows = np.arange(n) if n <= most else np.sort(np.random.default_rng(0).choice(n, most, replace=False))
+    indices, middles, axes = [], [], []
+    for axis, ((first, second), change) in enumerate(zip(pairs, changes, strict=True)):
+        own = rows[(rows >= sum(counts[:axis])) & (rows < sum(counts[: axis + 1]))] - sum(counts[:axis])
+        here = np.unravel_index(np.flatnonzero(change)[own], change.shape)
         a, b = (values[part][here].astype(np.float64) for part in (first, second))
+        middles.append(2 * np.stack(here, axis=1) + np.eye(3, dtype=np.int64)[axis])
         index = np.stack(here, axis=1).astype(np.float64)
         index[:, axis] += (threshold - a) / (b - a)
         indices.append(index)
         axes.append(np.full(len(index), axis))
-    return _Crossings(np.concatenate(indices), np.concatenate(axes))
+    return _Crossings(np.concatenate(indices), np.concatenate(axes), np.concatenate(middles), n <= most)
 
 
 def _slope(
@@ -210,7 +224,7 @@ def _normals(slope: Float[np.ndarray, "p 3"], volume: Volume) -> Float[np.ndarra
     """Outward unit normals, zero where the smoothed values are flat."""
     down = -_to_mm(slope, volume)
     length = np.linalg.norm(down, axis=1, keepdims=True)
-    return np.divide(down, length, out=np.zeros_like(down), where=length > 1e-9)
+    return np.divide(down, length, out=np.zeros_like(down), where=length > 1e-6 * length.max(initial=0.0))
 
 
 def _axes(volume: Volume) -> Float[np.ndarray, "3 3"]:
@@ -220,7 +234,8 @@ def _axes(volume: Volume) -> Float[np.ndarray, "3 3"]:
 
 def _noise(values: Float[np.ndarray, "i j k"]) -> float:
     """Standard deviation of the noise of an image, from second differences, which smooth values have hardly any of."""
-    of_axes = [np.diff(values, 2, axis=axis).ravel() for axis in range(3) if values.shape[axis] > 2]
+    some = [slab[:, :, :3] for slab in np.array_split(values, _SLABS, axis=2) if slab.size]
+    of_axes = [np.diff(slab, 2, axis=axis).ravel() for slab in some for axis in range(3) if slab.shape[axis] > 2]
     second = np.concatenate([rows[rows != 0] for rows in of_axes]) if of_axes else np.zeros(0)
     return float(np.median(np.abs(second)) * 1.4826 / np.sqrt(6)) if len(second) else 0.0
 

@@ -1,13 +1,14 @@
 """MetaImage. The library that keeps it, SimpleITK, takes 260 MB; a header of text and plain voxels take this page."""
 
 import math
+import os
 import zlib
 from pathlib import Path
 
 import numpy as np
 
 from ..scan.scan import ScanError
-from .need import check_room
+from .need import DEFLATED, check_room
 from .volume import Volume
 
 _MOST_HEADER = 1 << 16
@@ -75,15 +76,15 @@ def _read_voxels(path: Path, fields: dict[str, str], start: int, n_bytes: int) -
         file = path
     else:
         if where.upper() == "LIST" or Path(where).name != where or "%" in where:
-            raise ScanError(f"its voxels are in '{where}'; one file beside it is read. Save it as .mha.")
+            raise ScanError(f"its voxels are in '{where[:60]}'; one file beside it is read. Save it as .mha.")
         file, start = path.parent / where, 0
-        if not file.is_file():
-            raise ScanError(f"its voxels are in '{where}', which is not beside it.")
+        if not os.path.isfile(file):  # also of a name that no file can have
+            raise ScanError(f"its voxels are in '{where[:60]}', which is not beside it.")
     packed = _true(fields, "CompressedData")
-    check_room(n_bytes, file.stat().st_size - start, packed)
+    check_room(n_bytes, file.stat().st_size - start, DEFLATED if packed else 1)
     skipped = int(_numbers(fields, "HeaderSize", 1, "0")[0])
     with file.open("rb") as voxels:
-        voxels.seek(file.stat().st_size - n_bytes if skipped == -1 else start + max(skipped, 0))
+        voxels.seek(file.stat().st_size - n_bytes if skipped == -1 and not packed else start + max(skipped, 0))
         data = voxels.read()
     if packed:
         try:

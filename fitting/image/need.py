@@ -5,8 +5,8 @@ from types import ModuleType
 
 from ..scan.scan import ScanError
 
-# The most that deflate packs; more is announced only by what is damaged, or made to fill memory.
-_MOST_PACKED = 1032
+# The most bytes that one of these holds; more is announced only by what is damaged, or made to fill memory.
+DEFLATED, BZIPPED = 1032, 1 << 20
 
 
 def need(module: str) -> ModuleType:
@@ -21,15 +21,15 @@ def need(module: str) -> ModuleType:
         raise ImportError(f"this image needs the extra `images`: pip install 'jaxsubdiv[images]' ({error}).") from error
 
 
-def check_room(announced: int, size: int, packed: bool) -> None:
+def check_room(announced: int, size: int, most: int) -> None:
     """See that a file can hold what its header announces, before anything is made of that size.
 
     Args:
         announced: bytes of the voxels.
         size: of the file, in bytes.
-        packed: whether its voxels are compressed.
+        most: that one byte of the file may stand for: 1 where nothing is compressed, else `DEFLATED` or `BZIPPED`.
     """
-    if announced <= 0 or announced > size * (_MOST_PACKED if packed else 1):
+    if announced <= 0 or announced > size * most:
         raise ScanError(
             f"its header announces {announced:,} bytes of voxels, and the file has {size:,}. It is damaged."
         )

@@ -27,6 +27,10 @@ _READERS: dict[str, Callable[[Path], Volume]] = {
 }
 
 
+_FARTHEST, _LEAST = 1e9, 1e-6  # mm: of any voxel from the origin, and from voxel to voxel
+_FLATTEST = 1e-3  # a voxel's volume, to that of a box of the same sides
+
+
 class Seen(NamedTuple):
     """A scan, and the image that it was seen in."""
 
@@ -80,17 +84,28 @@ def read_volume(path: str | os.PathLike[str], *, scale: float = 1.0) -> Volume:
         raise ValueError(f"`scale` must be positive and finite; got {scale}. 1000 turns metres into mm.")
     try:
         volume = _READERS[suffix](path)
+        volume = volume._replace(
+            layers=tuple(layer.astype(layer.dtype.newbyteorder("="), copy=False) for layer in volume.layers),
+            labels=tuple(label._replace(name=_plain(label.name)) for label in volume.labels),
+        ).scaled(scale)
         _check(volume)
     except ScanError as error:
         raise ScanError(f"{path.name}: {error}") from None
-    return volume.scaled(scale)
+    return volume
+
+
+def _plain(name: str) -> str:
+    """A name as it can be printed: on one line, and not longer than a line."""
+    return "".join(c if c.isprintable() else " " for c in name).strip()[:100]
 
 
 def _check(volume: Volume) -> None:
-    if not np.isfinite(volume.affine).all() or not 1e-12 < volume.voxel_volume < 1e12:
+    affine = volume.affine
+    sound = bool(np.isfinite(affine).all() and np.abs(affine).max() < _FARTHEST and volume.spacing.min() > _LEAST)
+    if not sound or volume.voxel_volume < _FLATTEST * np.prod(volume.spacing):
+        axes = "; ".join(" ".join(f"{x:g}" for x in axis) for axis in affine[:3, :3].T)
         raise ScanError(
-            f"its voxels have no size: the axes are {np.round(volume.affine[:3, :3], 6).tolist()}. Set spacing and "
-            "directions in the program that wrote it."
+            f"its voxels have no size: the axes are {axes}. Set spacing and directions in the program that wrote it."
         )
     if min(volume.layers[0].shape) < 2:
         raise ScanError(f"it has {list(volume.layers[0].shape)} voxels, which is no volume.")

@@ -1,5 +1,6 @@
 """Slices of an image through the middle of what was fitted, and where a surface cuts them."""
 
+from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
@@ -99,9 +100,10 @@ def _slice(
 def _ends(volume: Volume) -> list[str]:
     """For each index the letters of its two ends."""
     axes = volume.affine[:3, :3] / volume.spacing
+    # Each has a direction of its own, however oblique.
+    order = max(permutations(range(3)), key=lambda order: np.abs(axes[list(order), [0, 1, 2]]).sum())
     ends = []
-    for axis in range(3):
-        nearest = int(np.argmax(np.abs(axes[:, axis])))
+    for axis, nearest in enumerate(order):
         letters = _LETTERS[volume.frame or "RAS"][nearest]
         ends.append(letters if axes[nearest, axis] > 0 else letters[::-1])
     return ends

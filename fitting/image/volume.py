@@ -1,5 +1,6 @@
 """Voxels and where they lie; the labels that they name."""
 
+from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,10 @@ from jaxsubdiv.frames import Frame
 
 from ..scan.scan import ScanError
 
-_MOST_LABELS = 4096  # whole numbers beyond it are grey values
+_MOST_LABELS = 4096  # more whole numbers than these are grey values
+_MOST_VALUE = 2**53  # of floats, larger ones are no whole numbers
+_PART = 1 << 18  # voxels that are counted at a time
+_GREY = "so it is an image and no label map: give --above VALUE (`above=`), which is the grey value of the surface."
 
 
 class Label(NamedTuple):
@@ -91,10 +95,10 @@ def find_labels(volume: Volume) -> list[Found]:
     names = {(label.layer, label.value): label for label in volume.labels}
     found = []
     for layer, values in enumerate(volume.layers):
-        for value, count in zip(*np.unique(_whole(values), return_counts=True), strict=True):
+        for value, count in _count(values).items():
             if value:
-                label = names.get((layer, int(value)), Label(int(value), "", layer))
-                found.append(Found(label, int(count)))
+                label = names.get((layer, value), Label(value, "", layer))
+                found.append(Found(label, count))
     if not found:
         raise ScanError("it has no label: all of its voxels are 0.")
     return found
@@ -110,7 +114,7 @@ def choose_label(volume: Volume, wanted: str | int | None) -> Label:
     there = ", ".join(one.in_words(volume) for one in found)
     if wanted is None:
         if len(found) > 1:
-            raise ScanError(f"it has {len(found)} labels; choose by --label (`label=`) one, or all: {there}.")
+            raise ScanError(f"it has {len(found)} labels; choose one by --label (`label=`), or all: {there}.")
         return found[0].label
     word = str(wanted).strip().casefold()
     named = [one.label for one in found if word in (str(one.label.value), one.label.name.casefold())]
@@ -128,20 +132,26 @@ def mask_of(volume: Volume, label: Label) -> Shaped[np.ndarray, "i j k"]:
     return volume.layers[label.layer] == label.value
 
 
-def _whole(values: Shaped[np.ndarray, "i j k"]) -> Shaped[np.ndarray, "i j k"]:
-    if values.dtype.kind == "b":
-        return values.astype(np.uint8)
-    if values.dtype.kind == "f":
-        if not (np.isfinite(values).all() and np.array_equal(values, np.round(values))):
-            raise ScanError(
-                "its voxels are no whole numbers, so it is an image and no label map: give --above VALUE (`above=`), "
-                "which is the grey value of the surface."
-            )
-        values = values.astype(np.int64)
-    low, high = (int(values.min()), int(values.max())) if values.size else (0, 0)
-    if (high - low > _MOST_LABELS and len(np.unique(values)) > _MOST_LABELS) or low < 0:
-        raise ScanError(
-            f"its voxels go from {low} to {high}, so it is an image and no label map: give --above VALUE (`above=`), "
-            "which is the grey value of the surface."
-        )
-    return values
+def _count(values: Shaped[np.ndarray, "i j k"]) -> dict[int, int]:
+    """How many voxels have each value, in the order of the values; part by part, for large volumes."""
+    flat = values.ravel(order="K")
+    parts = [flat[i : i + _PART] for i in range(0, len(flat), _PART)]
+    low, high = (flat.min(), flat.max()) if parts else (0, 0)
+    if values.dtype.kind == "f" and not (
+        np.isfinite(low) and np.isfinite(high) and all(np.array_equal(part, np.round(part)) for part in parts)
+    ):
+        raise ScanError(f"its voxels are no whole numbers, {_GREY}")
+    counts: Counter[int] = Counter()
+    for part in parts if 0 <= low and high < _MOST_VALUE else ():
+        if high < _PART:
+            numbers = np.bincount(part.astype(np.intp))
+            there = np.flatnonzero(numbers)
+            numbers = numbers[there]
+        else:
+            there, numbers = np.unique(part, return_counts=True)
+        counts.update(dict(zip(map(int, there), map(int, numbers), strict=True)))
+        if len(counts) > _MOST_LABELS:
+            break
+    if not 0 < len(counts) <= _MOST_LABELS:
+        raise ScanError(f"its voxels go from {low:g} to {high:g}, {_GREY}")
+    return dict(sorted(counts.items()))

@@ -1,5 +1,6 @@
 """Damage of the kinds that files meet: cuts, changed bytes, other numbers, parts twice or missing."""
 
+import gzip
 import io
 import re
 import zipfile
@@ -12,14 +13,18 @@ _TOKENS = [
     *(b"\n", b"\r", b"\\\n", b"\t", b";", b"//", b"<", b">", b"&#0;", b"null", b"true", b"[]", b"{}", b"[" * 3000),
     *(b"=" * 5, b"<!ENTITY a 'b'>", b"4294967295", b"|O", b"<M8[ns]", b"<U9", b"<c16", b"(9999999999,)", b"LPS"),
 ]
+_BINARY = [b"\0" * 8, b"\xff" * 8, b"\xff\x7f" * 4, b"\1" + b"\0" * 7, b"\0\0\xc0\x7f" * 2, b"\0\0\x80\x7f" * 2]
+_BINARY += [b"\2\0\0\0" * 2, b"\0\0\0\x7f" * 2, b"\x20\0" * 4, b"\0\2" * 4, b"\0\x10\0\0\0\0\0\0"]
 _NUMBER = re.compile(rb"[-+]?[0-9]+(\.[0-9]+)?")
 _WORD = re.compile(rb"[A-Za-z_]+")
 
 
 def mutated(data: bytes, rng: np.random.Generator) -> bytes:
-    """The data with one or two kinds of damage; archives often inside of one member, with sums that fit."""
+    """The data with one or two kinds of damage; archives often inside of what is packed, with sums that fit."""
     if data.startswith(b"PK") and rng.random() < 0.7:
         return _in_member(data, rng)
+    if data.startswith(b"\x1f\x8b") and rng.random() < 0.8:
+        return gzip.compress(mutated(gzip.decompress(data), rng), mtime=0)
     for _ in range(int(rng.integers(1, 3))):
         data = _damaged(data, rng)
     return data
@@ -43,7 +48,7 @@ def _in_member(data: bytes, rng: np.random.Generator) -> bytes:
 def _damaged(data: bytes, rng: np.random.Generator) -> bytes:
     at, until = sorted(int(i) for i in rng.integers(0, len(data) + 1, 2))
     token = _TOKENS[int(rng.integers(len(_TOKENS)))]
-    match int(rng.integers(9)):
+    match int(rng.integers(10)):
         case 0:
             return data[:at]
         case 1:
@@ -57,7 +62,11 @@ def _damaged(data: bytes, rng: np.random.Generator) -> bytes:
         case 5 if len(data):
             at = min(at, len(data) - 1)
             return data[:at] + bytes([data[at] ^ (1 << int(rng.integers(8)))]) + data[at + 1 :]
-        case 6:
+        case 6 if len(data) > 2:  # a number of a binary header
+            size = int(rng.choice([2, 4, 8]))
+            at = size * int(min(len(data), 600) * rng.random() // size)
+            return data[:at] + _BINARY[int(rng.integers(len(_BINARY)))][:size] + data[at + size :]
+        case 7:
             return _replaced(data, _WORD, token, rng)
         case _:
             return _replaced(data, _NUMBER, token, rng)

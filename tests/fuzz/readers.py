@@ -1,6 +1,7 @@
 """Damaged files for every reader: each is read, or refused by an error that the reader documents.
 
     python tests/fuzz/readers.py --minutes 60          # counts, and what was found, at the end and meanwhile
+    python tests/fuzz/readers.py --only .nrrd .dcm     # the files whose names end so
     python tests/fuzz/readers.py --case 1234           # reads that one again, and leaves its file in this folder
 
 Files are read in a process of its own, which may end, hang or run out of memory: then the next one goes on.
@@ -40,25 +41,34 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=1.0)
     parser.add_argument("--cases", type=int, default=sys.maxsize, help="stop after so many")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", nargs="+", metavar="SUFFIX", default=[""], help="of the files: .nii.gz .nrrd")
     parser.add_argument("--case", type=int, help="only this one, with its error in full")
     parser.add_argument("--work", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.case is not None:
-        return _show(options.seed, options.case)
+        return _show(_known(options.only), options.seed, options.case)
     if options.work is not None:
-        _work(options.seed, options.work)
+        _work(_known(options.only), options.seed, options.work)
         return 0
-    counts = _supervise(options.seed, time.monotonic() + 60 * options.minutes, options.cases)
+    counts = _supervise(options.only, options.seed, time.monotonic() + 60 * options.minutes, options.cases)
     print(", ".join(f"{outcome}: {counts[outcome]}" for outcome in _OUTCOMES))
     return int(any(counts[outcome] for outcome in _OUTCOMES[2:]))
 
 
-def _supervise(seed: int, end: float, n_cases: int) -> Counter[str]:
+def _known(only: list[str]) -> list[Seed]:
+    """The seeds whose names end so."""
+    known = [one for one in seeds() if one.name.endswith(tuple(only))]
+    if not known:
+        sys.exit(f"no seed's name ends with {' or '.join(only)}")
+    return known
+
+
+def _supervise(only: list[str], seed: int, end: float, n_cases: int) -> Counter[str]:
     """Let processes read one case after the other; what happened to each of them."""
     counts: Counter[str] = Counter()
     case = 0
     while time.monotonic() < end and case < n_cases:
-        command = [sys.executable, __file__, "--seed", str(seed), "--work", str(case)]
+        command = [sys.executable, __file__, "--seed", str(seed), "--work", str(case), "--only", *only]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as worker:
             assert worker.stdout is not None
             limit, ended = _STARTS, False
@@ -87,10 +97,9 @@ def _note(counts: Counter[str], case: int, outcome: str, words: str) -> bool:
     return True
 
 
-def _work(seed: int, case: int) -> None:
+def _work(known: list[Seed], seed: int, case: int) -> None:
     """Read cases from this one on, and say what happened, a line each."""
     said, sys.stdout = sys.stdout, sys.stderr  # what libraries print is not an answer
-    known = seeds()
     here = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (here + _BYTES,) * 2)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -139,8 +148,8 @@ def _peak(reset: bool = False) -> int:
     return int(status["VmHWM"].split()[0]) * 1024
 
 
-def _show(seed: int, case: int) -> int:
-    one, data = _case(seeds(), seed, case)
+def _show(known: list[Seed], seed: int, case: int) -> int:
+    one, data = _case(known, seed, case)
     path = Path(f"case_{case}_{one.name}")
     path.write_bytes(data)
     print(f"{os.fspath(path)}: {one.name}, {len(data)} bytes")

@@ -1,18 +1,25 @@
 """Small sound files of every kind that the package reads, made anew each time, and who reads them."""
 
+import gzip
 import io
 import json
 import struct
 import tempfile
+import warnings
 import zlib
 from base64 import b64encode
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import highdicom
 import jax
 import jax.numpy as jnp
+import nibabel
+import nrrd
 import numpy as np
+import pydicom
+from pydicom.sr.codedict import codes
 
 import fitting
 import jaxsubdiv as js
@@ -44,6 +51,7 @@ def seeds() -> list[Seed]:
     found += [Seed(name, data, js.read_points, (js.MeshError,), 0.5) for name, data in meshes.items()]
     found += [Seed(name, data, _scan, (js.MeshError, fitting.ScanError)) for name, data in points.items()]
     found += [Seed(name, data, fitting.read_landmarks, (fitting.ScanError,)) for name, data in landmarks.items()]
+    found += [Seed(name, data, _labels, (fitting.ScanError,)) for name, data in (_images() | _dicom()).items()]
     return found + _saved()
 
 
@@ -54,6 +62,18 @@ def _scan(path: Path) -> fitting.Scan:
         if "label" not in str(error):
             raise
         return fitting.read_scan(path)
+
+
+def _labels(path: Path) -> Any:
+    """The labels, and of a small volume the first one's scan."""
+    volume = fitting.read_volume(path)
+    try:
+        found = fitting.find_labels(volume)
+        if volume.layers[0].size < 10_000:
+            return fitting.scan_of_label(volume, found[0].label)
+    except fitting.ScanError as error:  # of what is in the volume: `fitting.read_scan` tells the file
+        raise fitting.ScanError(f"{path.name}: {error}") from None
+    return found
 
 
 def _written() -> dict[str, bytes]:
@@ -260,6 +280,92 @@ def _landmarks() -> dict[str, bytes]:
         "marks.mrk.json": _markups(),
         "marks.fcsv": (old + "1,1,2,3,1,F-1,\n2,4,5,6,1,F-2,\n").encode(),
     }
+
+
+def _images() -> dict[str, bytes]:
+    """A block of one label in another, as each format has it, plain and packed."""
+    values = np.zeros((6, 5, 4), np.int16)
+    values[1:5, 1:4, 1:3], values[2, 2, 2] = 1, 2
+    affine = np.array([[0.0, -2, 0, 5], [1.5, 0, 0, -7], [0, 0, 3, 1], [0, 0, 0, 1]])
+    image = nibabel.Nifti1Image(values, affine)
+    table = b'<LabelTable><Label Key="1" Red="1"><![CDATA[liver]]></Label><Label Key="2">cyst</Label></LabelTable>'
+    image.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, table))
+    scaled = nibabel.Nifti1Image(values.astype(">i2"), affine, nibabel.Nifti1Header(endianness=">"))
+    scaled.header.set_slope_inter(2.0, 0)
+    header = {"space": "left-posterior-superior", "space directions": affine[:3, :3], "space origin": affine[:3, 3]}
+    layered = header | {
+        "space directions": np.insert(affine[:3, :3], 0, np.nan, axis=0),
+        "kinds": ["list"] + ["domain"] * 3,
+    }
+    layered |= {
+        f"Segment{n}_{key}": value
+        for n in (0, 1)
+        for key, value in zip(("Name", "LabelValue", "Layer"), ("ab"[n], "1", str(n)), strict=True)
+    }
+    layered |= {"Segmentation_ReferenceImageExtentOffset": "4 0 7"}
+    voxels = np.asfortranarray(values).tobytes(order="F")
+    meta = "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\nCompressedData = {}\n"
+    meta += "TransformMatrix = 0 1 0 -1 0 0 0 0 1\nOffset = 5 -7 1\nElementSpacing = 1.5 2 3\nDimSize = 6 5 4\n"
+    meta += "ElementType = MET_SHORT\nElementDataFile = LOCAL\n"
+    return {
+        "labels.nii": image.to_bytes(),
+        "labels.nii.gz": gzip.compress(image.to_bytes(), mtime=0),
+        "second.nii": nibabel.Nifti2Image(values.astype(np.float32), affine).to_bytes(),
+        "scaled.nii.gz": gzip.compress(scaled.to_bytes(), mtime=0),
+        "raw.nrrd": _nrrd(values.astype(">i2"), header, "raw"),
+        "packed.nrrd": _nrrd(values.astype(np.uint8), header, "gzip"),
+        "text.nrrd": _nrrd(values, header, "ascii"),
+        "bzip2.nrrd": _nrrd(values, header, "bzip2"),
+        "layers.seg.nrrd": _nrrd(np.stack([values == 1, values == 2]).astype(np.uint8), layered, "gzip"),
+        "plain.mha": meta.format("False").encode() + voxels,
+        "packed.mha": meta.format("True").encode() + zlib.compress(voxels),
+    }
+
+
+def _nrrd(values: np.ndarray, header: dict[str, Any], encoding: str) -> bytes:
+    file = io.BytesIO()
+    nrrd.write(file, values, header | {"encoding": encoding})
+    return file.getvalue()
+
+
+def _dicom() -> dict[str, bytes]:
+    """A segmentation of two segments in four slices."""
+    slices = []
+    for k in range(4):
+        one = pydicom.Dataset()
+        one.file_meta = pydicom.dataset.FileMetaDataset()
+        one.file_meta.TransferSyntaxUID = pydicom.uid.ExplicitVRLittleEndian
+        one.SOPClassUID = one.file_meta.MediaStorageSOPClassUID = pydicom.uid.CTImageStorage
+        one.SOPInstanceUID, one.StudyInstanceUID, one.SeriesInstanceUID, one.FrameOfReferenceUID = (
+            f"1.2.{k}",
+            "1.3",
+            "1.4",
+            "1.5",
+        )
+        for empty in ("PatientBirthDate", "PatientSex", "AccessionNumber", "StudyDate", "StudyTime"):
+            setattr(one, empty, "")
+        one.ReferringPhysicianName = one.PositionReferenceIndicator = ""
+        one.Modality, one.PatientID, one.PatientName, one.StudyID = "CT", "1", "A^B", "1"
+        one.SeriesNumber, one.InstanceNumber = 1, k + 1
+        one.Rows, one.Columns, one.PixelSpacing, one.SliceThickness = 5, 6, [2.0, 1.5], 3.0
+        one.ImageOrientationPatient, one.ImagePositionPatient = [1, 0, 0, 0, 1, 0], [10.0, -20.0, 3.0 * k]
+        one.SamplesPerPixel, one.PhotometricInterpretation, one.PixelRepresentation = 1, "MONOCHROME2", 0
+        one.BitsAllocated = one.BitsStored = 16
+        one.HighBit, one.PixelData = 15, bytes(60)
+        slices.append(one)
+    mask = np.zeros((4, 5, 6, 2), np.uint8)
+    mask[1:3, 1:4, 1:5, 0], mask[1, 2, 2, 1] = 1, 1
+    manual = highdicom.seg.SegmentAlgorithmTypeValues.MANUAL
+    segments = [
+        highdicom.seg.SegmentDescription(n, "ab"[n - 1], codes.SCT.Organ, codes.SCT.Liver, manual) for n in (1, 2)
+    ]
+    file = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        highdicom.seg.Segmentation(
+            slices, mask, "BINARY", segments, "1.6", 1, "1.7", 1, "maker", "model", "1", "0"
+        ).save_as(file)
+    return {"segments.dcm": file.getvalue()}
 
 
 def _saved() -> list[Seed]:
