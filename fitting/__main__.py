@@ -53,6 +53,7 @@ from .scan.landmarks import (
 )
 from .scan.regions import Groups, match_regions, read_groups
 from .scan.scan import Scan
+from .start.mesh_topology import topology_of
 from .start.parts import PartKind
 
 _EXAMPLE_NOISE = 3.0  # mm: the example starts from a control mesh that is wrong, to show that the fit mends it
@@ -297,6 +298,8 @@ def _fit(scan: _Source | None, folder: Path, options: argparse.Namespace, recipe
     report, off = found.result.report(uncertainty=True), misfit(found.result)
     print(f"done     in {seconds:.1f} s{_ending(found, off)}\n\n{dataclasses.replace(report, warnings=[])}\n")
     _save(folder, found, title, marks, job, options)
+    if job.seen is not None and job.mesh is None and (rims := topology_of(found.result.control_mesh).boundary_loops):
+        print(f"note     the surface has {rims} rim{'s' * (rims > 1)}: past the end of the image nothing is known")
     _print_warnings(found.result)
     return _row(title, found.result, off, seconds)
 

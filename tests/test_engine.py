@@ -58,10 +58,10 @@ def test_one_sweep_goes_where_it_always_went(name, monkeypatch):
         stored = dict(file)
     calls = []
 
-    def find(surface, points):
+    def find(surface, points, *of_regions):
         calls.append(1)
         first = js.SurfacePoint(jnp.asarray(stored["face"], jnp.int32), jnp.asarray(stored["coordinates"]))
-        return first if len(calls) == 1 else closest_points(surface, points)
+        return first if len(calls) == 1 else closest_points(surface, points, *of_regions)
 
     monkeypatch.setattr(sweeps, "closest_points", find)
     found = problem().fit(max_sweeps=1, **SWEEPS[name])
