@@ -192,7 +192,7 @@ def test_curve_along_a_part_leaves_the_rest_to_the_scan():
 
 
 def test_new_pairs_compile_nothing():
-    fitted(-2.0, True)
+    fit(scan(-2.0), BoundaryCurve(square(-1.0, 21.0), 0.2))  # anew: programs may have been forgotten since the last
     programs = elements.differentiate, sweeps.hold_priors, sweeps._retract, pairing.measure
     before = [program._cached._cache_size() for program in programs]
     fit(scan(1.0), BoundaryCurve(square(-0.5, 20.5), 0.3))
