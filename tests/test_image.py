@@ -19,12 +19,14 @@ import pytest
 import SimpleITK as sitk
 from pydicom.sr.codedict import codes
 from scipy.ndimage import gaussian_filter
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 import fitting
 import jaxsubdiv as js
 from fitting.__main__ import main as fit_command
 from fitting.image.volume import mask_of
+from fitting.start.mesh_topology import MeshTopology, face_topology
 from jaxsubdiv.frames import in_frame
 
 SHAPE, SPACING = (9, 8, 7), np.array([0.5, 1.25, 3.0])
@@ -268,6 +270,26 @@ def test_the_surface_is_open_where_the_image_ends():
 
 def rim_edges(mesh: js.ControlMesh) -> np.ndarray:
     return np.bincount(mesh.half_edges.edge) == 1
+
+
+def test_a_thin_sheet_starts_from_its_outline():
+    volume, inside = ellipsoid(1.0)
+    index = np.stack(np.meshgrid(*map(np.arange, inside.shape), indexing="ij"), axis=-1).reshape(-1, 3).astype(float)
+    along = ((volume.positions(index) - MIDDLE) @ TURN[:, 0]).reshape(inside.shape)
+    cup = ((inside > 0) & (inside < 0.15) & (along > 0)).astype(np.uint8)  # half of a shell, 2 to 3 voxels thick
+    with pytest.warns(UserWarning, match="thinner than two voxels"):
+        scan = fitting.scan_of_label(volume._replace(layers=(cup,)), fitting.Label(1, ""))
+    assert scan.outlined and scan.faces is not None
+    assert MeshTopology(1, 0, 0, 2) == face_topology({3: scan.faces, 4: np.zeros((0, 4), np.int32)})
+    a, b, c = np.moveaxis(np.asarray(scan.points)[scan.faces] - MIDDLE, 1, 0)
+    assert np.einsum("tx,tx->", a, np.cross(b, c)) / 6 == pytest.approx(cup.sum(), rel=0.02)  # mm^3, wound outwards
+
+    mesh = fitting.control_mesh(scan, faces=300)
+
+    assert fitting.topology_of(mesh) == MeshTopology(1, 0, 0, 2)
+    edge = np.linalg.norm(np.diff(mesh.vertices[mesh.half_edges.edges], axis=1), axis=2).mean()
+    far = KDTree(mesh.vertices).query(np.asarray(scan.points))[0]
+    assert np.quantile(far, 0.95) < 2 * edge  # near enough for the fit, which draws the rim out
 
 
 def test_thin_parts_are_named():

@@ -15,7 +15,7 @@ from ..scan.closest_points import nearest_rows
 from ..scan.scan import Scan, ScanError
 from .align import sample_faces
 from .cloud import Cloud, clean
-from .outline import misses_thin_parts, parts_of_outline
+from .outline import is_better, parts_of_outline
 from .parts import Part, PartKind, choose, find_parts, points_of_others
 from .reconstruct import reconstruct_smoothly
 from .remesh import Coarse, Dense, coarsen, paired, relaxed
@@ -91,7 +91,7 @@ def make_control_mesh(scan: Scan, *, faces: int, kind: FaceKind, closed: bool | 
     _need_extra()
     cloud = clean(scan)
     parts = find_parts(cloud, closed)
-    thin = scan.outlined and closed is None and misses_thin_parts(parts, cloud)
+    thin = closed is None and is_better(scan, cloud, parts)
     parts = parts_of_outline(scan, cloud) if thin else parts
     chosen, others, findings = choose(parts, part)
     findings = (*_unit_doubt(float(np.linalg.norm(np.ptp(cloud.points, axis=0)))), *findings)

@@ -5,6 +5,7 @@ from scipy.spatial import KDTree
 
 from ..scan.scan import Scan
 from .cloud import LEAST_POINTS, Cloud
+from .mesh_topology import face_topology
 from .parts import Part
 from .reconstruct import separate
 from .remesh import Dense
@@ -35,7 +36,15 @@ def parts_of_outline(scan: Scan, cloud: Cloud) -> list[Part]:
     return parts
 
 
-def misses_thin_parts(parts: list[Part], cloud: Cloud) -> bool:
-    """Whether points lie off a surface that was reconstructed from them: it is rounded off where the scan is thin."""
+def is_better(scan: Scan, cloud: Cloud, parts: list[Part]) -> bool:
+    """Whether the outline serves better than the parts of a surface that was reconstructed from the points.
+
+    Where the scan is thin, that surface is rounded off, so that points lie off it, or has holes that the outline lacks.
+    """
+    if not scan.outlined or scan.faces is None:
+        return False
+    own = face_topology({3: scan.faces, 4: np.zeros((0, 4), np.int64)})
+    if sum(part.topology.genus for part in parts) > own.genus:
+        return True
     tree = KDTree(np.concatenate([part.dense.vertices for part in parts]))
     return bool(np.quantile(tree.query(cloud.points, workers=-1)[0], _OFTEN) > _OFF * cloud.spacing)
