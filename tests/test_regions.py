@@ -13,6 +13,7 @@ from scans import noise, problem
 
 import fitting
 import jaxsubdiv as js
+from fitting.__main__ import main as fit_command
 from fitting.scan.regions import Choice, read_groups
 
 GROUPS = ("inner", "outer")
@@ -321,3 +322,20 @@ def test_names_that_obj_does_not_hold_are_refused(tmp_path):
     mesh = js.ControlMesh(np.eye(3), [(0, 1, 2)], regions=["a # b"])
     with pytest.raises(js.MeshError, match="OBJ holds no group of the name 'a # b'"):
         js.write_mesh(tmp_path / "a.obj", mesh)
+
+
+def test_the_command_tells_which_label_is_of_which_group(tmp_path, command_settings, capsys):
+    points, words = shell_points()
+    rows = [f"{x},{y},{z},SAX_{word}" for (x, y, z), word in zip(points.tolist(), words, strict=True)]
+    (tmp_path / "scan.csv").write_text("\n".join(["x,y,z,label", *rows]) + "\n")
+    js.write_mesh(tmp_path / "template.obj", shell())
+    (tmp_path / "groups.json").write_text(json.dumps({"SAX_inner": "nowhere"}))
+    inputs = [str(tmp_path / "scan.csv"), "--control", str(tmp_path / "template.obj"), "--levels", "2"]
+
+    assert fit_command([*inputs, "-o", str(tmp_path / "out"), "--max-sweeps", "1"]) == 1  # it has not come to rest
+    printed = capsys.readouterr().out
+    assert "region   SAX_inner: 750 points, on inner" in printed
+    assert "RMS in outer" in printed
+
+    assert fit_command([*inputs, "-o", str(tmp_path / "bad"), "--regions", str(tmp_path / "groups.json")]) == 2
+    assert "put 'SAX_inner' on 'nowhere', which is no group of the control mesh" in capsys.readouterr().err
