@@ -1,5 +1,6 @@
-"""The one error that a mesh or a mesh file can raise, and how it names rows."""
+"""The one error that a mesh or a mesh file can raise, how it names rows, and the check of a file's unit."""
 
+import math
 from collections.abc import Iterable
 
 
@@ -20,3 +21,9 @@ def name_rows(rows: Iterable[object], most: int = 5) -> str:
     rows = list(rows)
     named = ", ".join(str(row) for row in rows[:most])
     return named if len(rows) <= most else f"{named} (+{len(rows) - most} more)"
+
+
+def check_scale(scale: float | int) -> None:
+    """Raise a ValueError for a factor of coordinates that takes them nowhere."""
+    if not (math.isfinite(scale) and scale > 0):
+        raise ValueError(f"`scale` must be positive and finite; got {scale}. 1000 turns metres into mm.")

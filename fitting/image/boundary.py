@@ -28,11 +28,15 @@ class _Crossings(NamedTuple):
 
     at: Float[np.ndarray, "p 3"]
     """Indices, between whole numbers along one axis."""
-    axis: Int[np.ndarray, "p"]
     middle: Int[np.ndarray, "p 3"]
     """Twice the index of the middle of each pair of voxels."""
     all: bool
     """False where these are a part of all."""
+
+    @property
+    def axis(self) -> Int[np.ndarray, "p"]:
+        """The axis of each pair: along it the middle lies between whole numbers."""
+        return (self.middle % 2).argmax(axis=1)
 
 
 def scan_of_label(volume: Volume, label: Label, *, most_points: int = MOST_POINTS) -> Scan:
@@ -66,8 +70,9 @@ def scan_of_label(volume: Volume, label: Label, *, most_points: int = MOST_POINT
     slope = _slope(inside.astype(np.float32), found.at, _widths(volume))
     outward = _normals(slope, volume)
     _tell_thin(inside, found, outward, volume, str(label))
-    across = np.einsum("px,px->p", outward, _axes(volume)[found.axis])
-    deviations = volume.spacing[found.axis] * np.sqrt((across**2 + _TURNED**2) / 12)
+    axis = found.axis
+    across = np.einsum("px,px->p", outward, _axes(volume)[axis])
+    deviations = volume.spacing[axis] * np.sqrt((across**2 + _TURNED**2) / 12)
     return _scan(volume, low, inside, found, outward, deviations)
 
 
@@ -190,7 +195,7 @@ def _find_crossings(values: Shaped[np.ndarray, "i j k"], threshold: float, most:
     counts = [int(np.count_nonzero(change)) for change in changes]
     n = sum(counts)
     rows = np.arange(n) if n <= most else np.sort(np.random.default_rng(0).choice(n, most, replace=False))
-    indices, middles, axes = [], [], []
+    indices, middles = [], []
     for axis, ((first, second), change) in enumerate(zip(pairs, changes, strict=True)):
         own = rows[(rows >= sum(counts[:axis])) & (rows < sum(counts[: axis + 1]))] - sum(counts[:axis])
         here = np.unravel_index(np.flatnonzero(change)[own], change.shape)
@@ -199,8 +204,7 @@ def _find_crossings(values: Shaped[np.ndarray, "i j k"], threshold: float, most:
         index = np.stack(here, axis=1).astype(np.float64)
         index[:, axis] += (threshold - a) / (b - a)
         indices.append(index)
-        axes.append(np.full(len(index), axis))
-    return _Crossings(np.concatenate(indices), np.concatenate(axes), np.concatenate(middles), n <= most)
+    return _Crossings(np.concatenate(indices), np.concatenate(middles), n <= most)
 
 
 def _slope(

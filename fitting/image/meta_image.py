@@ -31,11 +31,11 @@ _TYPES = {
 def read(path: Path) -> Volume:
     """The volume, in LPS, as ITK has it. The voxels of an `.mhd` lie in the file that it names, beside it."""
     fields, rest = _read_header(path)
-    if _one(fields, "NDims", "3") != "3":
+    if fields.get("NDims", "3") != "3":
         raise ScanError(f"it has {fields['NDims']} dimensions; three are read.")
-    kind = _TYPES.get(_one(fields, "ElementType", "").upper())
-    if kind is None or _one(fields, "ElementNumberOfChannels", "1") != "1":
-        raise ScanError(f"its voxels are of the type '{_one(fields, 'ElementType', '')}'; one number each is read.")
+    kind = _TYPES.get(fields.get("ElementType", "").upper())
+    if kind is None or fields.get("ElementNumberOfChannels", "1") != "1":
+        raise ScanError(f"its voxels are of the type '{fields.get('ElementType', '')}'; one number each is read.")
     shape = _numbers(fields, "DimSize", 3).astype(int)
     order = ">" if _true(fields, "BinaryDataByteOrderMSB") or _true(fields, "ElementByteOrderMSB") else "<"
     dtype = np.dtype(order + kind)
@@ -94,10 +94,6 @@ def _read_voxels(path: Path, fields: dict[str, str], start: int, n_bytes: int) -
     if len(data) < n_bytes:
         raise ScanError(f"it ends after {len(data):,} of {n_bytes:,} bytes of voxels. Was it copied to its end?")
     return data[:n_bytes]
-
-
-def _one(fields: dict[str, str], name: str, default: str) -> str:
-    return fields.get(name, default)
 
 
 def _true(fields: dict[str, str], name: str) -> bool:

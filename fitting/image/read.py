@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxsubdiv.errors import check_scale
 from jaxsubdiv.notices import warn
 
 from ..scan.scan import Scan, ScanError
@@ -80,8 +81,7 @@ def read_volume(path: str | os.PathLike[str], *, scale: float = 1.0) -> Volume:
         raise ScanError(f"{path.name}: images have one of the suffixes {', '.join(_READERS)}.")
     if not path.is_file():
         raise FileNotFoundError(errno.ENOENT, "no such file", str(path))
-    if not (np.isfinite(scale) and scale > 0):
-        raise ValueError(f"`scale` must be positive and finite; got {scale}. 1000 turns metres into mm.")
+    check_scale(scale)
     try:
         volume = _READERS[suffix](path)
         volume = volume._replace(

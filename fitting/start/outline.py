@@ -5,8 +5,7 @@ from scipy.spatial import KDTree
 
 from ..scan.scan import Scan
 from .cloud import LEAST_POINTS, Cloud
-from .mesh_topology import face_topology
-from .parts import Part
+from .parts import Part, nearest_piece, some_of
 from .reconstruct import separate
 from .remesh import Dense
 
@@ -25,14 +24,12 @@ def parts_of_outline(scan: Scan, cloud: Cloud) -> list[Part]:
         n_iter=_ROUNDS, pass_band=_PASS_BAND, boundary_smoothing=False, normalize_coordinates=True
     )
     pieces = separate(Dense(np.asarray(smooth.points, np.float64), np.asarray(scan.faces)))
-    owner = np.repeat(np.arange(len(pieces)), [len(piece.vertices) for piece in pieces])
-    nearest = owner[KDTree(np.concatenate([piece.vertices for piece in pieces])).query(cloud.points, workers=-1)[1]]
+    nearest = nearest_piece(cloud.points, np.full(len(cloud.points), np.inf), pieces)
     parts: list[Part] = []
     for i, dense in enumerate(pieces):
         own = nearest == i
         if own.sum() >= LEAST_POINTS or not parts:
-            points, normals, reach = (rows[own] for rows in (cloud.points, cloud.normals, cloud.reach))
-            parts.append(Part(cloud._replace(points=points, normals=normals, reach=reach), dense, dense.topology()))
+            parts.append(Part(some_of(cloud, own), dense, dense.topology()))
     return parts
 
 
@@ -43,7 +40,7 @@ def is_better(scan: Scan, cloud: Cloud, parts: list[Part]) -> bool:
     """
     if not scan.outlined or scan.faces is None:
         return False
-    own = face_topology({3: scan.faces, 4: np.zeros((0, 4), np.int64)})
+    own = Dense(np.asarray(scan.points), scan.faces).topology()
     if sum(part.topology.genus for part in parts) > own.genus:
         return True
     tree = KDTree(np.concatenate([part.dense.vertices for part in parts]))

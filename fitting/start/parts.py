@@ -41,7 +41,7 @@ def find_parts(cloud: Cloud, closed: bool | None) -> list[Part]:
         of_labels: list[Part] = []
         for one in np.unique(cloud.label[cloud.label >= 0]):
             try:
-                of_labels += find_parts(_some_of(cloud, cloud.label == one)._replace(label=None), closed)
+                of_labels += find_parts(some_of(cloud, cloud.label == one)._replace(label=None), closed)
             except ScanError:
                 continue  # too small, or no surface
         if of_labels:
@@ -52,16 +52,16 @@ def find_parts(cloud: Cloud, closed: bool | None) -> list[Part]:
     rest, n = _turned_outwards(cloud) if cloud.given else cloud, len(cloud.points)
     found = reconstruct(rest, closed)
     while len(parts) < _MOST_PARTS:
-        own = _nearest_piece(found.cloud.points, found.cloud.reach, found.pieces)
+        own = nearest_piece(found.cloud.points, found.cloud.reach, found.pieces)
         if parts and np.mean(own >= 0) < _ITS_OWN:
             break
         for i, dense in enumerate(found.pieces):
             it = own == i
             if it.sum() >= LEAST_POINTS or not parts:
                 topology = found.topology if i == 0 else dense.topology()
-                part = Part(_some_of(found.cloud, it), dense, topology)
+                part = Part(some_of(found.cloud, it), dense, topology)
                 parts.append(part if cloud.given else _outside_out(part))
-        beside = _nearest_piece(rest.points, rest.reach, found.pieces) < 0
+        beside = nearest_piece(rest.points, rest.reach, found.pieces) < 0
         if beside.sum() < max(_MORE * n, LEAST_POINTS):
             break
         try:
@@ -73,7 +73,8 @@ def find_parts(cloud: Cloud, closed: bool | None) -> list[Part]:
     return sorted(parts, key=lambda part: -part.dense.areas.sum())
 
 
-def _some_of(cloud: Cloud, chosen: Bool[np.ndarray, "p"]) -> Cloud:
+def some_of(cloud: Cloud, chosen: Bool[np.ndarray, "p"]) -> Cloud:
+    """The chosen points, with what is known of each but its label."""
     points, normals, reach = (rows[chosen] for rows in (cloud.points, cloud.normals, cloud.reach))
     return cloud._replace(points=points, normals=normals, reach=reach)
 
@@ -106,11 +107,11 @@ def choose(parts: list[Part], kind: PartKind | None) -> tuple[list[Part], list[P
 def points_of_others(points: Float[np.ndarray, "p 3"], chosen: list[Part], others: list[Part]) -> np.ndarray:
     """Which points lie on parts that were left out."""
     reach = np.full(len(points), np.median(np.concatenate([part.cloud.reach for part in [*chosen, *others]])))
-    return _nearest_piece(points, reach, [part.dense for part in [*chosen, *others]]) >= len(chosen)
+    return nearest_piece(points, reach, [part.dense for part in [*chosen, *others]]) >= len(chosen)
 
 
-def _nearest_piece(points: Float[np.ndarray, "p 3"], reach: Float[np.ndarray, "p"], pieces: list[Dense]) -> np.ndarray:
-    """Of every point the piece that it lies on, -1 where it lies on none."""
+def nearest_piece(points: Float[np.ndarray, "p 3"], reach: Float[np.ndarray, "p"], pieces: list[Dense]) -> np.ndarray:
+    """Of every point the nearest piece, -1 where that is farther than twice its reach: on none."""
     owner = np.repeat(np.arange(len(pieces)), [len(piece.vertices) for piece in pieces])
     distance, row = KDTree(np.concatenate([piece.vertices for piece in pieces])).query(points, workers=-1)
     return np.where(distance <= _NEAR * np.maximum(reach, np.median(reach)), owner[row], -1)

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from .._mesh import ControlMesh
-from ..errors import MeshError, name_rows
+from ..errors import MeshError, check_scale, name_rows
 from ..files import replacing
 from ..frames import Frame
 from ..markups import read_control_points
@@ -131,7 +131,7 @@ def read_mesh(path: str | os.PathLike[str], *, scale: float | int = 1.0, check: 
     path, format_ = _open(path)
     if format_.read_mesh is None:
         raise MeshError(f"{path.name}: {path.suffix} files hold points without faces. Read it with `read_points`.")
-    _check_scale(scale)
+    check_scale(scale)
     contents = _told_unit(path, format_.read_mesh(path), scale)
     if contents.faces is None:
         raise MeshError(f"{path.name}: it holds points but no faces. Read it with `read_points`.")
@@ -184,7 +184,7 @@ def read_labelled_points(
 ) -> tuple[PointCloud, dict[str, list[str]]]:
     """The points of `read_points`, and columns of text beside them: those of the names that a table's header has."""
     path, format_ = _open(path)
-    _check_scale(scale)
+    check_scale(scale)
     contents = _told_unit(path, format_.read_points(path), scale)
     points = _scaled(_numbers(path.name, "points", contents.vertices, (None, 3)), scale)
     n = len(points)
@@ -363,11 +363,6 @@ def _suffixes(able_to: str) -> str:
     return ", ".join(
         suffix for suffix, format_ in able.items() if format_ is not _GIFTI_DATA or able_to == "holds_data"
     )
-
-
-def _check_scale(scale: float | int) -> None:
-    if not (np.isfinite(scale) and scale > 0):
-        raise ValueError(f"`scale` must be positive and finite; got {scale}. 1000 turns metres into mm.")
 
 
 def _contents(path: Path, mesh: Surface) -> Contents:
