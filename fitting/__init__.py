@@ -48,6 +48,7 @@ from .run.recipe import fit as fit
 from .run.recipe import fit_scan as fit_scan
 from .run.recipe import load as load
 from .run.recipe import load_recipe as load_recipe
+from .run.series import fit_series as fit_series
 from .scan.closest_points import closest_points as closest_points
 from .scan.example import example as example
 from .scan.landmarks import Landmarks as Landmarks

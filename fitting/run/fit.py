@@ -16,6 +16,7 @@ import jaxsubdiv as js
 from jaxsubdiv.linalg import unit
 from jaxsubdiv.notices import warn
 
+from ..finding import Origin
 from ..model.limits import check_numbers
 from ..model.pairing import Scene, make_scene
 from ..model.priors import Priors
@@ -33,6 +34,7 @@ from ..scan.landmarks import Landmarks
 from ..scan.regions import RegionMatch
 from ..scan.scan import Scan, ScanError
 from ..solve.conjugate_gradients import ConjugateGradients
+from ..solve.pilot import FromPilot
 from ..solve.sparse_normal import SparseNormal, find_structure
 from ..solve.strengths import FromScan, first_strengths
 from ..solve.sweeps import State, Subject, Sweeps, hold_priors, subject_residual
@@ -164,6 +166,34 @@ def fit(
     state = solver.init(subject_residual, y, subject, {}, None, None, nothing)
     if kept is not None and (before := kept.read_tree((y, state))) is not None:
         y, state = before
+    y, state, result = run_sweeps(solver, subject, y, state, control, on_sweep, kept)
+    if kept is not None and not keep_checkpoint:
+        kept.remove()
+    found = FitResult(
+        record_fit(model, y, state, scene, scan, control, inputs, Settings.of(scheme, topology, **settings), result)
+    )
+    if throw:
+        refuse_unfinished(found)
+    return found
+
+
+def run_sweeps(
+    solver: Sweeps,
+    subject: Subject,
+    y: Variables,
+    state: State,
+    control: js.Control,
+    on_sweep: Callable[[Sweep], None] | None,
+    kept: Checkpoint | None = None,
+) -> tuple[Variables, State, optx.RESULTS]:
+    """Step a solver until the surface has come to rest.
+
+    Args:
+        control: where the fit started.
+        on_sweep: called after every sweep.
+        kept: where the state after every sweep is kept.
+    """
+    nothing = frozenset()
     # Where JAX solves, a sweep is one program; on the host it is many small ones between sparse matrices.
     step = solver.step if isinstance(solver.linear_solver, SparseNormal) else eqx.filter_jit(solver.step)
     done, result = False, optx.RESULTS.successful
@@ -178,18 +208,17 @@ def fit(
             on_sweep(Sweep(k, float(state.robust_rms[k]), moved))
         if kept is not None and not done:
             kept.write_tree((y, state))
-    if kept is not None and not keep_checkpoint:
-        kept.remove()
-    found = FitResult(
-        record_fit(model, y, state, scene, scan, control, inputs, Settings.of(scheme, topology, **settings), result)
-    )
-    if throw and result != optx.RESULTS.successful:
+    return y, state, result
+
+
+def refuse_unfinished(found: FitResult) -> None:
+    """Raise where a fit did not converge."""
+    if found.result != optx.RESULTS.successful:
         rms = found.rms
         raise RuntimeError(
             f"the fit did not converge in {len(rms) - 1} sweeps (RMS {rms[0]:.3f} -> {rms[-1]:.3f} mm): "
             f"{found.report().reason}. Give more `max_sweeps`, a better start, or throw=False to get what there is."
         )
-    return found
 
 
 def make_solver(
@@ -200,8 +229,9 @@ def make_solver(
     loss: AbstractLoss,
     tolerance: float,
     max_sweeps: int,
+    strengths: FromScan | FromPilot | None = None,
 ) -> Sweeps:
-    """The solver of a fit whose strengths follow from the scan."""
+    """The solver of a fit, whose strengths by default follow from the scan."""
     if linear_solver is None:
         linear_solver = "sparse" if jax.default_backend() == "cpu" else "conjugate gradients"
     if linear_solver == "sparse":
@@ -212,7 +242,7 @@ def make_solver(
         solver = ConjugateGradients(max(_TIGHT, _ROUNDING * eps), _MOST_STEPS)
     return Sweeps(
         linear_solver=solver,
-        strengths=FromScan(),
+        strengths=strengths or FromScan(),
         loss=loss,
         rtol=tolerance,
         max_sweeps=max_sweeps,
@@ -251,6 +281,7 @@ def record_fit(
     inputs: dict[str, Any],
     settings: Settings,
     result: optx.RESULTS,
+    origin: Origin | None = None,
 ) -> Fit:
     """What a solver found, as data on the host."""
     state = jax.tree.map(np.asarray, state)
@@ -270,6 +301,7 @@ def record_fit(
         rms=state.rms[:n],
         robust_rms=state.robust_rms[:n],
         result=result,
+        origin=origin or Origin(),
     )
 
 

@@ -41,6 +41,7 @@ from .elements import (
 )
 
 _MOST_RINGS = 3
+_SOLVED, _MOST_STEPS = 1e-2, 100  # of conjugate gradients: of the norm of what is left, in that of the near part
 _REGULAR = 1e-12  # of the largest entry: what no row determines stays
 
 
@@ -97,6 +98,7 @@ class _Tied(NamedTuple):
     seeds_of: Int[np.ndarray, "m d"]
     columns: Int[np.ndarray, "m d"]
     """`n` where there are fewer than in other rows."""
+    is_distant: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +111,8 @@ class Structure:
     tied: list[_Tied]
     pattern: sp.csc_array
     """Of A."""
-    symbolic: Symbolic
+    near: sp.csc_array | None
+    """Without the rows of priors that couple vertices far from each other; None where there are none."""
     diagonal: Int[np.ndarray, "o"]
     """Where in A's values its diagonal stands."""
     fixed_entries: Int[np.ndarray, "_"]
@@ -121,6 +124,17 @@ class Structure:
     def n(self) -> int:
         """Number of unknowns of A."""
         return self.layout.n_own
+
+    @functools.cached_property
+    def symbolic(self) -> Symbolic:
+        """Order of elimination of A."""
+        return analyse_pattern(self.pattern)
+
+    @functools.cached_property
+    def near_symbolic(self) -> tuple[Symbolic, Int[np.ndarray, "_"]]:
+        """Order of elimination of the near part of A, and where its entries stand among A's."""
+        assert self.near is not None
+        return analyse_pattern(self.near), np.searchsorted(_keys(self.pattern), _keys(self.near))
 
     @property
     def corners(self) -> Int[np.ndarray, "g 4"]:
@@ -180,11 +194,13 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> Structur
     tied = [_tie(model, prior) for prior in model.vertex_priors]
     pattern = sp.csc_array(abs(sp.csc_array(elements.pattern.astype(float))[:n, :n])) + sp.eye_array(n, format="csc")
     pattern.data[:] = 1
-    for one in tied:
+    near = None
+    for one in sorted(tied, key=lambda one: one.is_distant):
+        if one.is_distant and near is None:
+            near = _sorted(pattern)
         by = _sparse(np.ones(one.columns.shape), one.columns, layout.n)
         pattern = pattern + abs(sp.csc_array((by.T @ by)[:n, :n]))
-    pattern = sp.csc_array(pattern)
-    pattern.sort_indices()
+    pattern = _sorted(pattern)
     keys, column = _keys(pattern), _columns(pattern)
     of_elements = elements.pattern
     source = np.flatnonzero((of_elements.indices < n) & (_columns(of_elements) < n))
@@ -196,7 +212,7 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> Structur
         patches,
         tied,
         pattern,
-        analyse_pattern(pattern),
+        near,
         np.flatnonzero(pattern.indices == column),
         np.flatnonzero(fixed[pattern.indices] | fixed[column]),
         (source, place),
@@ -229,8 +245,8 @@ def _tie(model: Model, prior: AbstractVertexPrior) -> _Tied:
         places = np.arange(layout.n)[layout.columns(name)]
         seeds_of = np.concatenate([seeds_of, np.tile(len(seeds) + np.arange(len(places)), (m, 1))], axis=1)
         columns = np.concatenate([columns, np.tile(places, (m, 1))], axis=1)
-        seeds = np.concatenate([seeds, np.eye(layout.n)[places]])
-    return _Tied(prior.name, seeds, seeds_of, columns)
+        seeds = np.concatenate([seeds, places[:, None] == np.arange(layout.n)])
+    return _Tied(prior.name, seeds, seeds_of, columns, prior.is_distant)
 
 
 @eqx.filter_jit
@@ -292,13 +308,22 @@ class SparseEquations:
     def solver(
         self, which: str, damping: Float[np.ndarray, "n"], active: Bool[np.ndarray, "k"] | None = None
     ) -> Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray, "n s"]]:
-        """Solves with the damped normal matrix of "all" rows, or of those of the "prior"s alone."""
+        """Solves with the damped normal matrix of "all" rows, or of those of the "prior"s alone: exactly, or where
+        priors couple vertices far from each other by conjugate gradients, the near part of the matrix going before."""
         matrix = self.prior if which == "prior" else self.data.plus(self.prior)
         factor = self._known.get((which, damping.tobytes()))
+        is_near = self.structure.near is not None
         if factor is None:
-            factor = self._known[which, damping.tobytes()] = self.factorise(matrix, damping, active)
+            factor = self._known[which, damping.tobytes()] = self.factorise(matrix, damping, active, near=is_near)
         free = self._free(active)[:, None]
-        return lambda sides: free * factor.solve(free * sides)
+        if not is_near:
+            return lambda sides: free * factor.solve(free * sides)
+        whole = self._damped(matrix, damping, active)
+
+        def multiply(x: Float[np.ndarray, "n s"]) -> Float[np.ndarray, "n s"]:
+            return free * self.multiply(whole, x)
+
+        return lambda sides: solve_preconditioned(multiply, lambda x: free * factor.solve(x), free * sides)
 
     def step(self, damping: Float[np.ndarray, "n"], active: Bool[np.ndarray, "k"]) -> Float[np.ndarray, "n"]:
         """The most probable offset, to first order."""
@@ -315,7 +340,11 @@ class SparseEquations:
         return free
 
     def factorise(
-        self, matrix: Arrowhead, damping: Float[np.ndarray, "n"], active: Bool[np.ndarray, "k"] | None = None
+        self,
+        matrix: Arrowhead,
+        damping: Float[np.ndarray, "n"],
+        active: Bool[np.ndarray, "k"] | None = None,
+        near: bool = False,
     ) -> ArrowheadFactor:
         """Factorise a matrix with a diagonal.
 
@@ -323,7 +352,22 @@ class SparseEquations:
             damping: added to the diagonal. What damps the vertices damps them about their common motion, where that is
                 an unknown.
             active: which shared unknowns take part; the others stay.
+            near: without the entries of priors that couple vertices far from each other, which take time.
         """
+        structure, n = self.structure, self.structure.n
+        values, border, corner = self._damped(matrix, damping, active)
+        pattern, symbolic = structure.pattern, structure.near_symbolic[0] if near else structure.symbolic
+        if near:
+            assert structure.near is not None
+            pattern, values = structure.near, values[structure.near_symbolic[1]]
+        factor = symbolic.factorise(sp.csc_array((values, pattern.indices, pattern.indptr), shape=(n, n)))
+        solved = factor.solve(border) if border.shape[1] else border
+        return ArrowheadFactor(factor, border, solved, _inverse(corner - border.T @ solved))
+
+    def _damped(
+        self, matrix: Arrowhead, damping: Float[np.ndarray, "n"], active: Bool[np.ndarray, "k"] | None
+    ) -> Arrowhead:
+        """A matrix with a diagonal, and 1 on that of what is fixed; see `factorise`."""
         structure, layout, n = self.structure, self.model.layout, self.structure.n
         inner, border, corner = matrix.inner.copy(), matrix.border.copy(), matrix.corner + np.diag(damping[n:])
         inner[structure.diagonal] += damping[:n]
@@ -343,10 +387,7 @@ class SparseEquations:
             corner[~active] = 0
             corner[:, ~active] = 0
             corner[~active, ~active] = 1
-        pattern = structure.pattern
-        factor = structure.symbolic.factorise(sp.csc_array((inner, pattern.indices, pattern.indptr), shape=(n, n)))
-        solved = factor.solve(border) if border.shape[1] else border
-        return ArrowheadFactor(factor, border, solved, _inverse(corner - border.T @ solved))
+        return Arrowhead(inner, border, corner)
 
     def to_dense(self, damping: Float[np.ndarray, "n"], which: Int[np.ndarray, "u"]) -> Float[np.ndarray, "u u"]:
         """The damped normal matrix of some unknowns, the others held."""
@@ -522,6 +563,37 @@ def _sparse(by: Float[np.ndarray, "m d"], columns: Int[np.ndarray, "m d"], n: in
         (by.ravel(), columns.ravel(), np.arange(0, m * d + 1, d) if d else np.zeros(m + 1, int)), shape=(m, n + 1)
     )
     return sp.csr_array(table[:, :n])
+
+
+def solve_preconditioned(
+    multiply: Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray, "n s"]],
+    precondition: Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray, "n s"]],
+    sides: Float[np.ndarray, "n s"],
+) -> Float[np.ndarray, "n s"]:
+    """Solutions with a symmetric positive matrix that is given by its products, for all right sides at once, by
+    conjugate gradients, with another such matrix that is near to it and easily solved with."""
+    x, left = np.zeros_like(sides), sides.copy()
+    way = precondition(left)
+    along = np.sum(left * way, axis=0)
+    target = _SOLVED**2 * along
+    for _ in range(_MOST_STEPS):
+        if np.all(along <= target):
+            break
+        there = multiply(way)
+        pace = along / np.maximum(np.sum(way * there, axis=0), np.finfo(float).tiny)
+        x += pace * way
+        left -= pace * there
+        next_way = precondition(left)
+        new = np.sum(left * next_way, axis=0)
+        way = next_way + new / np.maximum(along, np.finfo(float).tiny) * way
+        along = new
+    return x
+
+
+def _sorted(pattern: sp.sparray) -> sp.csc_array:
+    sorted_pattern = sp.csc_array(pattern)
+    sorted_pattern.sort_indices()
+    return sorted_pattern
 
 
 def _columns(pattern: sp.csc_array) -> Int[np.ndarray, "e"]:

@@ -246,7 +246,12 @@ def _sums(index: AnyArray, values: AnyArray | None, n: int, xp: Any) -> AnyArray
 
 
 def next_precisions(
-    families: list[Family], rows: Linearised, solve_prior: Solve, solve_posterior: Solve, xp: Any = np
+    families: list[Family],
+    rows: Linearised,
+    solve_prior: Solve,
+    solve_posterior: Solve,
+    xp: Any = np,
+    n_probes: int = _PROBES,
 ) -> list[AnyArray]:
     """One step of the fixed point, for all families together.
 
@@ -254,10 +259,11 @@ def next_precisions(
         rows: multiplies by the derivatives of each family's rows.
         solve_prior: with the normal matrix of all priors.
         solve_posterior: with that of the priors and the scan.
+        n_probes: random vectors of the traces.
     """
     generator = np.random.default_rng(0)
     roots, probes, sides = [], [], 0.0
-    drawn = generator.choice([-1.0, 1.0], size=(sum(len(one.left) for one in families), _PROBES))
+    drawn = generator.choice([-1.0, 1.0], size=(sum(len(one.left) for one in families), n_probes))
     first = 0
     for one in families:
         root = xp.where(one.strength >= 0, xp.sqrt(one.precision)[xp.maximum(one.strength, 0)], 0.0)

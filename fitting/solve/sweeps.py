@@ -10,6 +10,7 @@ conjugate gradients.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -31,6 +32,7 @@ from ..scan.closest_points import closest_points
 from ..scan.search_closest import search_closest
 from ..start.folds import Folds
 from .conjugate_gradients import ConjugateGradients
+from .pilot import FromPilot
 from .sparse_normal import SparseNormal
 from .strengths import FromScan, FromTargets, Strengths, count_determined, first_strengths
 
@@ -100,7 +102,7 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
 
     Attributes:
         linear_solver: `SparseNormal`, on the host, or `ConjugateGradients`, wherever JAX computes.
-        strengths: `FromScan`, or `FromTargets`.
+        strengths: `FromScan`, `FromTargets` or `FromPilot`.
         loss: how a point loses weight with its distance.
         rtol: converged once a sweep, annealed, moves nine tenths of the surface, and the RMS distance, by less than
             this part of the surface's uncertainty, or of a hundredth of a control edge, where that is more.
@@ -109,7 +111,7 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
     """
 
     linear_solver: SparseNormal | ConjugateGradients
-    strengths: FromScan | FromTargets
+    strengths: FromScan | FromTargets | FromPilot
     loss: AbstractLoss
     rtol: Any
     max_sweeps: int = eqx.field(static=True)
@@ -129,7 +131,7 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
         unknown = xp.full(self.max_sweeps + 1, np.nan, dtype)
         none = xp.zeros((), dtype)
         strengths = first_strengths(model)
-        if isinstance(self.strengths, FromTargets):
+        if not isinstance(self.strengths, FromScan):
             strengths = self.strengths.start(strengths)
         loose = loose_damping(model, xp)
         if xp is jnp:
@@ -262,6 +264,9 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
             new_strengths = eqx.tree_at(lambda one: one.determined, strengths, determined)
             solve_prior = lambda: rows.solver("prior", loose, active)  # noqa: E731
             new_strengths = self.strengths.update(model, y, new_strengths, rows, step, solve_prior, solve, xp)
+        elif isinstance(self.strengths, FromPilot):
+            solve_prior, solve_all = (partial(rows.solver, which, loose, active) for which in ("prior", "all"))
+            new_strengths = self.strengths.update(model, strengths, rows, step, solve_prior, solve_all, xp)
         else:
             new_strengths = self.strengths.update(model, strengths, xp)
         proposed = _retract(model, y, jnp.asarray(step, y.control.vertices.dtype))

@@ -13,6 +13,7 @@ from .boundary import BoundaryPrior
 from .height import Height
 from .landmarks import LandmarkPrior
 from .margin import Margin
+from .series import SeriesPrior
 from .shape_modes import ShapeModes, ShapePrior
 from .shifts import ShiftPrior
 from .stretch import Stretch
@@ -30,6 +31,7 @@ REGISTER: tuple[type[AbstractPrior], ...] = (
     ShiftPrior,
     SymmetryPrior,
     ShapePrior,
+    SeriesPrior,
 )
 """Every prior, in the order of its rows; a new one is one line here, and a field of `Priors` for its settings."""
 
@@ -66,6 +68,8 @@ class Priors(eqx.Module):
             to this one (`Modes`), or a `ShapeModes`: where the scan lacks something, it is filled by scores along the
             modes that the rest of the scan shows. Default: left out.
         shift: of how far breathing displaced a slice of the scan, in mm, along each of two axes of the slice's plane.
+        frame_change: of how far a control vertex moves from one frame of a series to the next, in mm, in each coordinate; see
+            `fit_series`. None, the default: found from the scans.
 
     Raises:
         ValueError: a standard deviation is not positive, or the likeness not from 0 to 1.
@@ -77,8 +81,9 @@ class Priors(eqx.Module):
     symmetry: Float[Array, ""] = eqx.field(converter=strong_float, default=np.inf)
     shift: Float[Array, ""] = eqx.field(converter=strong_float, default=3.0)
     likeness: Float[Array, ""] | None = eqx.field(converter=_if_given, default=None)
+    frame_change: Float[Array, ""] | None = eqx.field(converter=_if_given, default=None)
     shape: ShapeModes | None = eqx.field(converter=ShapeModes.of, default=None)
 
     def __check_init__(self):
-        check_numbers({name: getattr(self, name) for name in ("bend", "stretch", "symmetry", "shift", "likeness")})
+        check_numbers({name: getattr(self, name) for name in ("bend", "stretch", "symmetry", "shift", "frame_change", "likeness")})
         check_numbers({"h of priors": self.h})

@@ -135,6 +135,8 @@ class AbstractVertexPrior(AbstractPrior):
 
     uses: ClassVar[tuple[str, ...]] = ()
     """Names of the shared unknowns that its rows depend on."""
+    is_distant: ClassVar[bool] = False
+    """Whether its rows couple vertices that lie far from each other over the surface, many of them."""
 
     def vertices(self) -> Int[AnyArray, "m c"]:
         """The control vertices of every row."""

@@ -1,0 +1,180 @@
+"""`fit_series`: one anatomy in many frames, fitted at once by one control mesh."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+import jaxsubdiv as js
+from jaxsubdiv.notices import warn
+
+from ..finding import Origin
+from ..model.limits import check_numbers
+from ..model.pairing import make_scene
+from ..model.priors import Priors
+from ..model.priors.shifts import find_slice_planes
+from ..model.recipe import Settings
+from ..model.residual import Model, analyse
+from ..model.robust import AbstractLoss, geman_mcclure
+from ..model.unknowns import Free, Variables
+from ..report.record import choose_faces
+from ..report.result import FitResult
+from ..report.series import SeriesFit
+from ..scan.frames import check_slices, copies_of_faces, copy_mesh, place_frames
+from ..scan.landmarks import Landmarks
+from ..scan.regions import Groups, match_regions
+from ..scan.scan import Scan, ScanError
+from ..solve.pilot import FromPilot
+from ..solve.strengths import FromTargets
+from ..solve.sweeps import Subject, subject_residual
+from ..start.align import Kind, align
+from .fit import Sweep, check, fit, gather_inputs, make_solver, record_fit, refuse_unfinished, run_sweeps, sound_start
+from .fit_scan import first_control
+
+_FEWEST = 10  # points of a frame
+_FEW = 0.4  # of the points of most frames
+
+
+def fit_series(
+    scans: Sequence[Scan],
+    mesh: js.ControlMesh,
+    *,
+    names: Sequence[str] | None = None,
+    periodic: bool = False,
+    scheme: js.AbstractScheme | None = None,
+    levels: int = 2,
+    pose: Kind | None = Settings.pose,
+    regions: Groups | None = None,
+    free: Free | None = None,
+    priors: Priors | None = None,
+    loss: AbstractLoss | None = None,
+    max_sweeps: int = 60,
+    tolerance: float = 0.1,
+    throw: bool = True,
+    on_stage: Callable[[str], None] | None = None,
+    on_sweep: Callable[[Sweep], None] | None = None,
+) -> SeriesFit:
+    """Fit the frames of a series, such as those of a heart through its beat, by one control mesh.
+
+    All frames are fitted at once. A slice of the scans has one shift for all frames; control vertices move by little
+    from frame to frame (`Priors.frame_change`), which is found from the scans unless it is given. The template is
+    aligned with the first frame, for all. A fit of that frame alone finds how smooth the surface is, place by place.
+
+    Args:
+        scans: of the frames in their order, in mm. A slice has the same number in all of them.
+        mesh: the template.
+        names: of the frames, for texts and tables. Default: their numbers.
+        periodic: whether the first frame follows the last, as in a beat.
+        scheme: default: `js.Interpolating()`.
+        levels: of refinement.
+        pose: how the template may move to the first frame before the fit, see `align`; None leaves it where it is.
+        regions: as in `fit_scan`.
+        free, loss, max_sweeps, tolerance, on_sweep: as in `fit`.
+        priors: as in `fit`; neither shape nor symmetry.
+        throw: raise where the fit did not converge.
+        on_stage: told what begins, in a few words.
+
+    Raises:
+        ScanError: there are fewer than two frames; a frame has too few points, no slices though others have them, or a
+            slice in another plane; the text names the frame.
+        ValueError: as `fit_scan`; or the priors ask for shape or symmetry.
+        RuntimeError: with `throw`, the fit did not converge.
+
+    Warns:
+        UserWarning: a frame has far fewer points than the others.
+    """
+    check_numbers({"levels": levels, "max_sweeps": max_sweeps, "tolerance": tolerance})
+    names = [f"frame {k}" for k in range(len(scans))] if names is None else list(names)
+    _check_frames(scans, names)
+    free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
+    if priors.shape is not None or np.isfinite(priors.symmetry):
+        raise ValueError("a series is fitted without `Priors.shape` and `Priors.symmetry`: leave them out.")
+    say = on_stage or (lambda words: None)
+    scheme, origin = scheme or js.Interpolating(), Origin()
+    match_regions(scans[0], mesh, regions)  # before anything is computed: what cannot be matched is told at once
+    if pose is not None:
+        say("aligns the control mesh with the first frame")
+        alignment = align(mesh, scans[0], kind=pose)
+        mesh, origin = alignment.mesh, Origin(alignment.pose, alignment.doubts)
+    told = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
+    bare = js.ControlMesh(mesh.vertices, mesh.faces)
+    say("fits the first frame")
+    topology = js.build_topology(bare, scheme, levels)
+    first = first_control(mesh, scheme)
+    pilot = fit(scheme, topology, first, scans[0], regions=match_regions(scans[0], mesh, regions), throw=False, **told)
+
+    scan, frames = place_frames(scans, periodic)
+    n = len(scans)
+    say(f"fits {n} frames, {n * len(mesh.vertices):,} control vertices")
+    whole = copy_mesh(mesh, frames)
+    tables = js.build_topology(js.ControlMesh(whole.vertices, whole.faces), scheme, levels)
+    control = js.Control(jnp.asarray(frames.copies(np.asarray(first.vertices))), jnp.tile(first.normals, (n, 1)))
+    check(scheme, tables, control, scan)
+    control = sound_start(scheme, tables, control, free)
+    inputs = gather_inputs(scheme, tables, control, scan, free, None, 1.0, None)
+    match = match_regions(scan, whole, regions)
+    inputs |= {"regions": match, "frames": frames}
+    inputs["slices"] = find_slice_planes(frames.in_place(scan)) if free.shifts else None
+    model, y = analyse(scheme, tables, control, free, priors, inputs)
+    y = _start_at(pilot, y, frames.copies(np.asarray(pilot.control.vertices)), n)
+    scene = make_scene(scan, model.refine(y), inputs["slices"], choose_faces(match, model, y, scan))
+    strengths = FromPilot(_targets(pilot, model, topology.control_faces[3], n))
+    solver = make_solver(model, y, scene, None, loss, tolerance, max_sweeps, strengths)
+    subject = Subject(model, scene)
+    state = solver.init(subject_residual, y, subject, {}, None, None, frozenset())
+    y, state, ended = run_sweeps(solver, subject, y, state, control, on_sweep)
+    settings = Settings.of(scheme, tables, **told)
+    found = record_fit(model, y, state, scene, scan, control, inputs, settings, ended, origin)
+    result = FitResult(found)
+    if throw:
+        refuse_unfinished(result)
+    return SeriesFit(result, tuple(names))
+
+
+def _start_at(pilot: FitResult, y: Variables, vertices: np.ndarray, n: int) -> Variables:
+    """The variables of all frames where those of the first one ended."""
+    control = js.Control(jnp.asarray(vertices), jnp.tile(pilot.control.normals, (n, 1)))
+    own = pilot.fit.y.shared
+    shared = {name: own[name] if name in own and name == "h" else value for name, value in y.shared.items()}
+    return Variables(control, shared)
+
+
+def _targets(pilot: FitResult, model: Model, triangles: Int[np.ndarray, "t 3"], n: int) -> FromTargets:
+    """The strengths of one frame's priors for all frames."""
+    found = pilot.fit.strengths
+    n_faces = pilot.fit.topology.n_control_faces
+    values = {}
+    for prior in model.priors:
+        if not prior.n_strengths:
+            continue
+        given = prior.given_strengths()
+        if given is not None:
+            values[prior.name] = given
+        elif prior.n_strengths == n * n_faces:
+            values[prior.name] = copies_of_faces(found.values[prior.name], triangles, n)
+        elif prior.name in found.values:
+            values[prior.name] = found.values[prior.name]
+    return FromTargets(values, found.values["likeness"], n * found.determined)
+
+
+def _check_frames(scans: Sequence[Scan], names: Sequence[str]) -> None:
+    if len(scans) < 2:
+        raise ScanError(f"a series has two frames or more; got {len(scans)}. Fit a single frame by `fit_scan`.")
+    if len(names) != len(scans):
+        raise ValueError(f"there are {len(scans)} frames and {len(names)} names: give one each.")
+    counts = np.array([int((np.asarray(scan.weights_or_ones()) > 0).sum()) for scan in scans])
+    usual = float(np.median(counts))
+    for name, count in zip(names, counts, strict=True):
+        if count < _FEWEST:
+            raise ScanError(
+                f"{name}: the frame has {count} points, where most have {usual:.0f}. Leave the frame out, or give more."
+            )
+    few = [f"{name} ({count})" for name, count in zip(names, counts, strict=True) if count < _FEW * usual]
+    if few:
+        warn(
+            f"{', '.join(few)}: far fewer points than most frames have, {usual:.0f}. The surface there follows from "
+            "the frames before and after: look at its standard deviations.",
+        )
+    check_slices(scans, names)
