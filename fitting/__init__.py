@@ -37,6 +37,9 @@ from .report.refit import Refit as Refit
 from .report.report import Report as Report
 from .report.report import WorstPlace as WorstPlace
 from .report.result import FitResult as FitResult
+from .report.series import SeriesFit as SeriesFit
+from .report.series import load_series as load_series
+from .report.series_table import SeriesTable as SeriesTable
 from .run.carry import CarriedLandmarks as CarriedLandmarks
 from .run.carry import carry_landmarks as carry_landmarks
 from .run.cohort import fit_cohort as fit_cohort

@@ -1,11 +1,11 @@
 """`fit_series`: one anatomy in many frames, fitted at once by one control mesh."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 import jaxsubdiv as js
 from jaxsubdiv.notices import warn
@@ -14,7 +14,8 @@ from ..finding import Origin
 from ..model.limits import check_numbers
 from ..model.pairing import make_scene
 from ..model.priors import Priors
-from ..model.priors.shifts import find_slice_planes
+from ..model.priors.shifts import SlicePlanes, find_slice_planes
+from ..model.priors.valves import ValvePoints
 from ..model.recipe import Settings
 from ..model.residual import Model, analyse
 from ..model.robust import AbstractLoss, geman_mcclure
@@ -23,13 +24,13 @@ from ..report.record import choose_faces
 from ..report.result import FitResult
 from ..report.series import SeriesFit
 from ..scan.frames import check_slices, copies_of_faces, copy_mesh, place_frames
-from ..scan.landmarks import Landmarks
-from ..scan.regions import Groups, match_regions
+from ..scan.regions import Groups, RegionMatch, match_regions
 from ..scan.scan import Scan, ScanError
 from ..solve.pilot import FromPilot
 from ..solve.strengths import FromTargets
 from ..solve.sweeps import Subject, subject_residual
 from ..start.align import Kind, align
+from ..start.cavities import find_parts, find_valves
 from .fit import Sweep, check, fit, gather_inputs, make_solver, record_fit, refuse_unfinished, run_sweeps, sound_start
 from .fit_scan import first_control
 
@@ -47,6 +48,8 @@ def fit_series(
     levels: int = 2,
     pose: Kind | None = Settings.pose,
     regions: Groups | None = None,
+    valves: Sequence[str] | None = None,
+    valve_deviation: float = 1.0,
     free: Free | None = None,
     priors: Priors | None = None,
     loss: AbstractLoss | None = None,
@@ -71,6 +74,9 @@ def fit_series(
         levels: of refinement.
         pose: how the template may move to the first frame before the fit, see `align`; None leaves it where it is.
         regions: as in `fit_scan`.
+        valves: the template's groups that are valves, as `find_valves` takes them; default: those whose names say so.
+            Points whose label is of a valve lie on the rim of that, where it meets the lining of a cavity.
+        valve_deviation: how far they may be off it, as a standard deviation in mm.
         free, loss, max_sweeps, tolerance, on_sweep: as in `fit`.
         priors: as in `fit`; neither shape nor symmetry.
         throw: raise where the fit did not converge.
@@ -91,6 +97,7 @@ def fit_series(
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
     if priors.shape is not None or np.isfinite(priors.symmetry):
         raise ValueError("a series is fitted without `Priors.shape` and `Priors.symmetry`: leave them out.")
+    valves = find_valves(mesh, valves)
     say = on_stage or (lambda words: None)
     scheme, origin = scheme or js.Interpolating(), Origin()
     match_regions(scans[0], mesh, regions)  # before anything is computed: what cannot be matched is told at once
@@ -117,6 +124,7 @@ def fit_series(
     match = match_regions(scan, whole, regions)
     inputs |= {"regions": match, "frames": frames}
     inputs["slices"] = find_slice_planes(frames.in_place(scan)) if free.shifts else None
+    inputs["valves"], scan = _take_valve_points(scan, mesh, match, valves, valve_deviation, inputs["slices"], n)
     model, y = analyse(scheme, tables, control, free, priors, inputs)
     y = _start_at(pilot, y, frames.copies(np.asarray(pilot.control.vertices)), n)
     scene = make_scene(scan, model.refine(y), inputs["slices"], choose_faces(match, model, y, scan))
@@ -130,7 +138,43 @@ def fit_series(
     result = FitResult(found)
     if throw:
         refuse_unfinished(result)
-    return SeriesFit(result, tuple(names))
+    return SeriesFit(result, tuple(names), valves)
+
+
+def _take_valve_points(
+    scan: Scan,
+    mesh: js.ControlMesh,
+    match: RegionMatch | None,
+    names: Sequence[str],
+    deviation: float,
+    planes: SlicePlanes | None,
+    n: int,
+) -> tuple[ValvePoints | None, Scan]:
+    """The points of all frames that lie on rims of valves, and the scan in which these no longer count."""
+    if match is None or scan.regions is None or not names:
+        return None, scan
+    valve_of = {label: groups[0] for label, groups in match.groups if len(groups) == 1 and groups[0] in names}
+    words = scan.regions.words()
+    rows = np.array([word in valve_of for word in words]) & (np.asarray(scan.weights_or_ones()) > 0)
+    parts = find_parts(mesh, names)
+    beside = [part for part in parts if part.is_cavity] or list(parts)
+    if not rows.any() or not beside:
+        return None, scan
+    region = np.array(mesh.regions.words() if mesh.regions is not None else [])
+
+    def copied(faces: Bool[np.ndarray, "f"]) -> Bool[np.ndarray, "g"]:
+        return copies_of_faces(faces, mesh.faces[3], n)
+
+    given = ValvePoints(
+        np.asarray(scan.points, np.float64)[rows],
+        (np.full(scan.n_points, -1) if planes is None else planes.rows_of(scan))[rows],
+        np.array([names.index(valve_of[word]) for word, is_valve in zip(words, rows, strict=True) if is_valve]),
+        np.stack([copied(region == name) for name in names]),
+        copied(np.any([part.faces for part in beside], axis=0)),
+        deviation,
+    )
+    weights = np.where(rows, 0.0, np.asarray(scan.weights_or_ones()))
+    return given, dataclasses.replace(scan, weights=weights)
 
 
 def _start_at(pilot: FitResult, y: Variables, vertices: np.ndarray, n: int) -> Variables:

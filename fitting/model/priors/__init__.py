@@ -19,6 +19,7 @@ from .shifts import ShiftPrior
 from .stretch import Stretch
 from .symmetry import SymmetryPrior
 from .tangent_length import TangentLength
+from .valves import ValvePrior
 
 REGISTER: tuple[type[AbstractPrior], ...] = (
     Bend,
@@ -27,6 +28,7 @@ REGISTER: tuple[type[AbstractPrior], ...] = (
     Margin,
     LandmarkPrior,
     BoundaryPrior,
+    ValvePrior,
     TangentLength,
     ShiftPrior,
     SymmetryPrior,
