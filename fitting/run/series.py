@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 import jaxsubdiv as js
 from jaxsubdiv.notices import warn
@@ -14,7 +14,7 @@ from ..finding import Origin
 from ..model.limits import check_numbers
 from ..model.pairing import make_scene
 from ..model.priors import Priors
-from ..model.priors.shifts import SlicePlanes, find_slice_planes
+from ..model.priors.shifts import ShiftPrior, SlicePlanes, find_slice_planes
 from ..model.priors.valves import ValvePoints
 from ..model.recipe import Settings
 from ..model.residual import Model, analyse
@@ -23,7 +23,7 @@ from ..model.unknowns import Free, Variables
 from ..report.record import choose_faces
 from ..report.result import FitResult
 from ..report.series import SeriesFit
-from ..scan.frames import check_slices, copies_of_faces, copy_mesh, place_frames
+from ..scan.frames import Frames, check_slices, copies_of_faces, copy_mesh, place_frames
 from ..scan.regions import Groups, RegionMatch, match_regions
 from ..scan.scan import Scan, ScanError
 from ..solve.pilot import FromPilot
@@ -114,6 +114,8 @@ def fit_series(
 
     scan, frames = place_frames(scans, periodic)
     n = len(scans)
+    # One anatomy departs from the template once, and not in every frame anew.
+    told["priors"] = priors = dataclasses.replace(priors, stretch=priors.stretch * n**0.5)
     say(f"fits {n} frames, {n * len(mesh.vertices):,} control vertices")
     whole = copy_mesh(mesh, frames)
     tables = js.build_topology(js.ControlMesh(whole.vertices, whole.faces), scheme, levels)
@@ -126,7 +128,7 @@ def fit_series(
     inputs["slices"] = find_slice_planes(frames.in_place(scan)) if free.shifts else None
     inputs["valves"], scan = _take_valve_points(scan, mesh, match, valves, valve_deviation, inputs["slices"], n)
     model, y = analyse(scheme, tables, control, free, priors, inputs)
-    y = _start_at(pilot, y, frames.copies(np.asarray(pilot.control.vertices)), n)
+    y = _start_at(pilot, y, frames)
     scene = make_scene(scan, model.refine(y), inputs["slices"], choose_faces(match, model, y, scan))
     strengths = FromPilot(_targets(pilot, model, topology.control_faces[3], n))
     solver = make_solver(model, y, scene, None, loss, tolerance, max_sweeps, strengths)
@@ -177,12 +179,25 @@ def _take_valve_points(
     return given, dataclasses.replace(scan, weights=weights)
 
 
-def _start_at(pilot: FitResult, y: Variables, vertices: np.ndarray, n: int) -> Variables:
-    """The variables of all frames where those of the first one ended."""
-    control = js.Control(jnp.asarray(vertices), jnp.tile(pilot.control.normals, (n, 1)))
+def _start_at(pilot: FitResult, y: Variables, frames: Frames) -> Variables:
+    """The variables of all frames where those of the first one ended, less the motion that its slices have in common.
+
+    That motion is hardly known from the scan, and little by little only would the prior of the shifts take it back.
+    """
+    vertices = np.asarray(pilot.control.vertices) - _common_motion(pilot)
+    normals = jnp.tile(pilot.control.normals, (len(frames.counts), 1))
     own = pilot.fit.y.shared
     shared = {name: own[name] if name in own and name == "h" else value for name, value in y.shared.items()}
-    return Variables(control, shared)
+    return Variables(js.Control(jnp.asarray(frames.copies(vertices)), normals), shared)
+
+
+def _common_motion(result: FitResult) -> Float[np.ndarray, "3"]:
+    """The motion of all points whose components within the planes of the slices are nearest to their shifts, in mm."""
+    prior = result.fit.model.prior("shift")
+    if not isinstance(prior, ShiftPrior) or not result.fit.shifting:
+        return np.zeros(3)
+    planes = np.asarray(prior.planes, np.float64).reshape(-1, 3)
+    return np.linalg.lstsq(planes, np.asarray(result.fit.y.shared["shifts"], np.float64).ravel(), rcond=1e-3)[0]
 
 
 def _targets(pilot: FitResult, model: Model, triangles: Int[np.ndarray, "t 3"], n: int) -> FromTargets:

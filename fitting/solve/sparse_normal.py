@@ -41,7 +41,7 @@ from .elements import (
 )
 
 _MOST_RINGS = 3
-_SOLVED, _MOST_STEPS = 1e-2, 100  # of conjugate gradients: of the norm of what is left, in that of the near part
+_SOLVED, _MOST_STEPS = 1e-3, 100  # of conjugate gradients: of the norm of what is left, in that of the near part
 _REGULAR = 1e-12  # of the largest entry: what no row determines stays
 
 
@@ -461,7 +461,32 @@ class SparseEquations:
             first += count
         weights = np.concatenate(weights)
         self.gradient[: elements.n] += times_transposed(elements, by, weights * rows, self._row_faces)
-        return self.structure.arrange(normal_matrix(elements, by, weights, self._row_faces), self._n_shared)
+        found = self.structure.arrange(normal_matrix(elements, by, weights, self._row_faces), self._n_shared)
+        for prior in self.model.face_priors:
+            by_shifts = prior.by_shifts(held.priors[prior.name])
+            if by_shifts is not None and "shifts" in dict(self.model.layout.shared):
+                own = self._rows_of[prior.name]
+                self._couple_shifts(found, self.jacobian(prior.name), by_shifts, weights[own], rows[own])
+        return found
+
+    def _couple_shifts(
+        self,
+        matrix: Arrowhead,
+        by_own: sp.csr_array,
+        by_shifts: sp.csr_array,
+        weights: Float[np.ndarray, "m"],
+        rows: Float[np.ndarray, "m"],
+    ) -> None:
+        """Add to a matrix, and to the gradient, how shifts move the rows of a prior, by themselves and with others."""
+        n, columns = self.structure.n, self.model.layout.columns("shifts")
+        shifts = slice(columns.start - n, columns.stop - n)
+        weighed = sp.csr_array(sp.diags_array(weights) @ by_shifts)
+        across = (by_own.T @ weighed).toarray()
+        matrix.border[:, shifts] += across[:n]
+        matrix.corner[:, shifts] += across[n:]
+        matrix.corner[shifts] += across[n:].T
+        matrix.corner[shifts, shifts] += (by_shifts.T @ weighed).toarray()
+        self.gradient[columns] += weighed.T @ rows
 
     def _add_tied(self, tied: _Tied) -> Arrowhead:
         prior, layout = self._bare.prior(tied.prior), self.model.layout

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse as sp
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
@@ -128,6 +129,10 @@ class AbstractFacePrior(AbstractPrior):
     def faces(self, held: Any) -> Int[AnyArray, "m"]:
         """The control face of every row."""
         raise NotImplementedError
+
+    def by_shifts(self, held: Any) -> sp.csr_array | None:
+        """Derivatives of the rows by the shifts of slices, two a slice; None where there are none."""
+        return None
 
 
 class AbstractVertexPrior(AbstractPrior):

@@ -4,6 +4,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse as sp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -39,8 +40,6 @@ class _Paired(NamedTuple):
 
     side: Int[Array, "b"]
     along: Float[Array, "b"]
-    points: Float[Array, "b 3"]
-    """With the shifts of their slices."""
     directions: Float[Array, "b 2 3"]
     """Two unit vectors across the rim, which slides freely along itself."""
 
@@ -95,11 +94,7 @@ class ValvePrior(AbstractFacePrior):
 
     def hold(self, place: Place, strengths: dict[str, Any]) -> _Paired:
         assert place.surface is not None
-        vertices, points = place.surface.vertices, self.points
-        if "shifts" in place.shared:
-            planes, rows = jnp.asarray(self.planes, points.dtype), jnp.asarray(self.slices)
-            moved = jnp.sum(place.shared["shifts"].astype(points.dtype)[:, :, None] * planes, axis=1)
-            points = points + jnp.where((rows >= 0)[:, None], moved[jnp.maximum(rows, 0)], 0.0)
+        vertices, points = place.surface.vertices, self._shifted(place)
         ends = jnp.asarray(self.ends)
         start, sides = vertices[ends[:, 0]], vertices[ends[:, 1]] - vertices[ends[:, 0]]
 
@@ -113,15 +108,33 @@ class ValvePrior(AbstractFacePrior):
         tangent = unit(sides[side])
         normals = place.surface.normals[ends[side, 0]]
         first = unit(normals - dot(normals, tangent) * tangent)
-        return _Paired(side.astype(jnp.int32), along, points, jnp.stack([first, cross(tangent, first)], axis=1))
+        return _Paired(side.astype(jnp.int32), along, jnp.stack([first, cross(tangent, first)], axis=1))
 
     def rows(self, place: Place, held: _Paired) -> Float[Array, "m"]:
         """Distances across the rim over their standard deviation, two a point."""
         assert place.surface is not None
         a, b = (take(place.surface.vertices, jnp.asarray(self.ends)[held.side, i]) for i in (0, 1))
-        away = a + held.along[:, None] * (b - a) - held.points
+        away = a + held.along[:, None] * (b - a) - self._shifted(place)
         across = [dot(held.directions[:, i], away)[:, 0] for i in (0, 1)]
         return jnp.stack(across, axis=1).reshape(-1) / self.deviation
+
+    def _shifted(self, place: Place) -> Float[Array, "b 3"]:
+        """The points with the shifts of their slices."""
+        if "shifts" not in place.shared:
+            return self.points
+        planes, rows = jnp.asarray(self.planes, self.points.dtype), jnp.asarray(self.slices)
+        moved = jnp.sum(place.shared["shifts"].astype(planes.dtype)[:, :, None] * planes, axis=1)
+        return self.points + jnp.where((rows >= 0)[:, None], moved[jnp.maximum(rows, 0)], 0.0)
+
+    def by_shifts(self, held: _Paired) -> sp.csr_array:
+        slices, planes = np.asarray(self.slices), np.asarray(self.planes, np.float64)
+        moves = np.flatnonzero(slices >= 0)
+        directions = np.asarray(held.directions, np.float64)[moves]
+        values = -np.einsum("bix,bjx->bij", directions, planes[slices[moves]]) / float(self.deviation)
+        rows = np.broadcast_to((2 * moves[:, None] + np.arange(2))[:, :, None], values.shape)
+        columns = np.broadcast_to((2 * slices[moves][:, None] + np.arange(2))[:, None], values.shape)
+        shape = 2 * len(slices), 2 * len(planes)
+        return sp.csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape)
 
     def precisions(self, strengths: dict[str, Any]) -> Any:
         return 1.0
