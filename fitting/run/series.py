@@ -49,7 +49,7 @@ def fit_series(
     pose: Kind | None = Settings.pose,
     regions: Groups | None = None,
     valves: Sequence[str] | None = None,
-    valve_deviation: float = 1.0,
+    valve_deviation: float = 0.5,
     free: Free | None = None,
     priors: Priors | None = None,
     loss: AbstractLoss | None = None,

@@ -41,7 +41,7 @@ from .elements import (
 )
 
 _MOST_RINGS = 3
-_SOLVED, _MOST_STEPS = 1e-3, 100  # of conjugate gradients: of the norm of what is left, in that of the near part
+_SOLVED, _MOST_STEPS = 1e-2, 100  # of conjugate gradients: of the norm of what is left, in that of the near part
 _REGULAR = 1e-12  # of the largest entry: what no row determines stays
 
 
