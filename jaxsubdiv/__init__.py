@@ -45,6 +45,7 @@ from ._scheme import Loop as Loop
 from ._scheme import ModifiedButterfly as ModifiedButterfly
 from ._seams import SplitMesh as SplitMesh
 from ._seams import split_normals as split_normals
+from ._search_closest import search_closest as search_closest
 from ._stencils import interpolating_control as interpolating_control
 from ._stencils import stencils as stencils
 from ._surface import PointsAndNormals as PointsAndNormals
@@ -56,6 +57,7 @@ from ._surface import sample as sample
 from ._surface import sum_corners as sum_corners
 from ._topology import Topology as Topology
 from ._topology import build_topology as build_topology
+from .closest import FaceChoice as FaceChoice
 from .errors import MeshError as MeshError
 
 __version__ = _version("jaxsubdiv")
