@@ -138,7 +138,11 @@ def _search(
             jnp.where(nearer, jnp.stack([u[best], v[best]]), found.uv),
         )
 
-    none = _Found(jnp.min(keys), jnp.full((), jnp.inf, point.dtype), jnp.int32(0), jnp.zeros(2, point.dtype))
+    # Nothing found yet; made from the arguments, so that under `shard_map` it varies over devices as they do.
+    first = jnp.min(keys)
+    nothing = (first & 0).astype(jnp.int32)
+    zero = nothing.astype(point.dtype)
+    none = _Found(first, zero + jnp.inf, nothing, jnp.stack([zero, zero]))
     found = lax.while_loop(closer, look, none)
     return found.triangle, found.uv
 
