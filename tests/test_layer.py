@@ -31,6 +31,8 @@ def test_it_is_refine_for_any_leading_axes():
     assert batch.vertices.shape == batch.normals.shape == (1, 2, 18, 3) and batch.faces[3].shape == (32, 3)
     for i in range(2):
         np.testing.assert_allclose(batch.vertices[0, i], call(LAYER, BATCH[i]).vertices, rtol=1e-12, atol=1e-15)
+    by_vmap = eqx.filter_jit(eqx.filter_vmap(LAYER))(BATCH)
+    np.testing.assert_allclose(by_vmap.vertices, batch.vertices[0], rtol=1e-12, atol=1e-15)
     shared = call(LAYER, BATCH, N)  # one set of normals for all
     np.testing.assert_allclose(shared.normals[1], call(LAYER, BATCH[1], N).normals, atol=1e-12)
 
