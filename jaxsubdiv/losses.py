@@ -6,8 +6,9 @@ device, without a gradient: the derivative of a distance is that at fixed feet.
 """
 
 import functools
+import inspect
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,19 +23,28 @@ from ._search_nearest import search_nearest
 from ._surface import RefinedSurface, SurfacePoint, evaluate
 from .linalg import cross, dot, norm, take, unit
 
+_Arguments, _Result = ParamSpec("_Arguments"), TypeVar("_Result")
 
-def _of_each(quantity: Callable) -> Callable:
-    """A function of one surface, and of arrays that belong to it, for any leading axes of them all."""
+
+def _of_each(quantity: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """A function of one surface, and of arrays that belong to it, for any leading axes of them all.
+
+    What the function takes by its name alone is the same for the whole batch.
+    """
+    signature = inspect.signature(quantity)
 
     @functools.wraps(quantity)
-    def of_each(surface: RefinedSurface, *arrays: Any, **options: Any) -> Any:
+    def of_each(*arguments: Any, **named: Any) -> Any:
+        given = signature.bind(*arguments, **named)
+        given.apply_defaults()
+        surface, *arrays = given.args
         if surface.vertices.ndim == 2:
-            return quantity(surface, *arrays, **options)
+            return quantity(*given.args, **given.kwargs)
         # Faces have leading axes only where the surfaces have different ones.
         of_faces = {size: 0 if rows.ndim > 2 else None for size, rows in surface.faces.items()}
 
         def one(vertices: Any, normals: Any, faces: Any, *arrays: Any) -> Any:
-            return of_each(RefinedSurface(vertices, normals, faces), *arrays, **options)
+            return of_each(RefinedSurface(vertices, normals, faces), *arrays, **given.kwargs)
 
         axes = (0, 0, of_faces, *(0 for _ in arrays))
         return jax.vmap(one, in_axes=axes)(surface.vertices, surface.normals, surface.faces, *arrays)
@@ -52,6 +62,19 @@ def _mean(rows: Float[Array, "p"], weights: Float[Array, "p"] | None) -> Float[A
 
 
 @_of_each
+def closest_places(surface: RefinedSurface, points: Float[Array, "p 3"]) -> SurfacePoint:
+    """Where the surface is closest to every point: `search_closest`, for any leading axes.
+
+    Several losses of one surface and one cloud can share it.
+
+    Args:
+        surface: triangles, quads or both.
+        points: positions.
+    """
+    return search_closest(surface, points.astype(surface.vertices.dtype))
+
+
+@_of_each
 def distances_to_surface(
     surface: RefinedSurface, points: Float[Array, "p 3"], at: SurfacePoint | None = None
 ) -> Float[Array, "p"]:
@@ -63,10 +86,10 @@ def distances_to_surface(
     Args:
         surface: triangles, quads or both.
         points: positions.
-        at: the closest places, where they are known from `search_closest`.
+        at: the closest places, where they are known from `closest_places`.
     """
     points = points.astype(surface.vertices.dtype)
-    at = search_closest(surface, points) if at is None else at
+    at = closest_places(surface, points) if at is None else at
     return norm(points - evaluate(surface, at).points)[:, 0]
 
 
@@ -102,7 +125,7 @@ def chamfer_distance(
         surface: triangles, quads or both.
         points: positions.
         weights: of the points, not negative; 0 for rows that fill up a batch of clouds.
-        at: the points' closest places, where they are known from `search_closest`.
+        at: the points' closest places, where they are known from `closest_places`.
     """
     there, back = distances_to_surface(surface, points, at), distances_to_points(surface, points, weights)
     return _mean(there**2, weights) + _mean(back**2, surface.vertex_areas())
@@ -125,11 +148,11 @@ def normal_disagreement(
         points: positions.
         normals: of the points, of any length; a zero normal counts as one at right angles.
         weights: of the points, not negative.
-        at: the points' closest places, where they are known from `search_closest`.
+        at: the points' closest places, where they are known from `closest_places`.
         oriented: whether the normals point outwards for sure; if not, the mean of 1 - (n_p . n_S)^2.
     """
     dtype = surface.vertices.dtype
-    at = search_closest(surface, points.astype(dtype)) if at is None else at
+    at = closest_places(surface, points) if at is None else at
     cosines = dot(unit(normals.astype(dtype)), evaluate(surface, at).normals)[:, 0]
     return _mean(1 - (cosines if oriented else cosines**2), weights)
 

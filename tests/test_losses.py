@@ -36,7 +36,7 @@ def all_losses(vertices, normals, points, faces=ROUGH.faces):
         [
             jnp.mean(losses.distances_to_surface(surface, points), axis=-1),
             jnp.mean(losses.distances_to_points(surface, points), axis=-1),
-            losses.chamfer_distance(surface, points, jnp.broadcast_to(WEIGHTS, points.shape[:-1])),
+            losses.chamfer_distance(surface, points, weights=jnp.broadcast_to(WEIGHTS, points.shape[:-1])),
             losses.normal_disagreement(surface, points, jnp.broadcast_to(DIRECTIONS, points.shape)),
             losses.surface_area(surface, part=PART),
             losses.enclosed_volume(surface, part=PART),
