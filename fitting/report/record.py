@@ -15,7 +15,7 @@ from ..model.pairing import Look, Scene
 from ..model.recipe import Settings
 from ..model.residual import Held, Model
 from ..model.unknowns import Variables
-from ..scan.regions import Choice, RegionMatch
+from ..scan.regions import RegionMatch
 from ..scan.scan import Scan
 from ..solve.sparse_normal import SparseEquations, Structure, find_structure
 from ..solve.strengths import Strengths
@@ -127,7 +127,7 @@ class Fit:
         return SparseEquations(structure, self.model, self.y, held)
 
 
-def choose_faces(regions: RegionMatch | None, model: Model, y: Variables, scan: Scan) -> Choice | None:
+def choose_faces(regions: RegionMatch | None, model: Model, y: Variables, scan: Scan) -> js.FaceChoice | None:
     """The faces of the surface that each point of a scan may be paired with; None where all may be with any."""
     if regions is None or not regions.groups:
         return None
