@@ -18,7 +18,7 @@ from ..model.pairing import make_scene
 from ..model.recipe import Settings
 from ..scan.scan import Scan
 from .at_level import SurfaceAtLevel
-from .coverage import distances_to_scan, vertex_areas, weighted_quantile, worst_places
+from .coverage import distances_to_scan, weighted_quantile, worst_places
 from .evidence import gather_evidence
 from .findings import find_what_speaks_against
 from .posterior import Posterior, Uncertainty
@@ -114,7 +114,8 @@ class FitResult:
     @functools.cached_property
     def _seen_from_the_scan(self) -> tuple[Float[np.ndarray, "v"], Float[np.ndarray, "v"]]:
         """Of every vertex of the surface its area, and its distance to the scan; see `distances_to_scan`."""
-        return vertex_areas(self.surface), distances_to_scan(self.surface, self.fit.look, self.inliers)
+        areas = np.asarray(self.surface.vertex_areas(), np.float64)
+        return areas, distances_to_scan(self.surface, self.fit.look, self.inliers)
 
     @functools.cached_property
     def control_mesh(self) -> js.ControlMesh:

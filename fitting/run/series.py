@@ -27,6 +27,7 @@ from ..scan.frames import Frames, check_slices, copies_of_faces, copy_mesh, plac
 from ..scan.regions import Groups, RegionMatch, match_regions
 from ..scan.scan import Scan, ScanError
 from ..solve.pilot import FromPilot
+from ..solve.sparse_normal import SparseNormal
 from ..solve.strengths import FromTargets
 from ..solve.sweeps import Subject, subject_residual
 from ..start.align import Kind, align
@@ -136,8 +137,10 @@ def fit_series(
     state = solver.init(subject_residual, y, subject, {}, None, None, frozenset())
     y, state, ended = run_sweeps(solver, subject, y, state, control, on_sweep)
     settings = Settings.of(scheme, tables, **told)
-    found = record_fit(model, y, state, scene, scan, control, inputs, settings, ended, origin)
-    result = FitResult(found)
+    record = record_fit(model, y, state, scene, scan, control, inputs, settings, ended, origin)
+    if isinstance(solver.linear_solver, SparseNormal):
+        record = dataclasses.replace(record, structure=solver.linear_solver.structure)
+    result = FitResult(record)
     if throw:
         refuse_unfinished(result)
     return SeriesFit(result, tuple(names), valves)

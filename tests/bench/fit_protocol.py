@@ -220,7 +220,7 @@ def judge(
     kept, right = result.inliers, problem.of_head
     f1 = 2 * np.sum(kept & right) / (np.sum(kept) + np.sum(right))
     vertices = np.asarray(result.surface.vertices, np.float64)
-    on, areas = nearest(truth, vertices).points, fitting.report.coverage.vertex_areas(result.surface)
+    on, areas = nearest(truth, vertices).points, np.asarray(result.surface.vertex_areas(), float)
     known = areas * (np.linalg.norm(on - centre, axis=1) >= radius)
     within = np.linalg.norm(on - vertices, axis=1) <= result.uncertainty().surface
     return Judgement(float(f1), float(np.sum(known * within) / np.sum(known)), crossing_faces(surface_of(result)))
