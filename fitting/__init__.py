@@ -28,6 +28,7 @@ from .model.robust import Tukey as Tukey
 from .model.robust import cauchy as cauchy
 from .model.robust import geman_mcclure as geman_mcclure
 from .model.unknowns import Free as Free
+from .report.animation import animate_series as animate_series
 from .report.cohort import Cohort as Cohort
 from .report.page import write_page as write_page
 from .report.picture import draw_fit as draw_fit
@@ -39,6 +40,7 @@ from .report.report import WorstPlace as WorstPlace
 from .report.result import FitResult as FitResult
 from .report.series import SeriesFit as SeriesFit
 from .report.series import load_series as load_series
+from .report.series_page import write_series_page as write_series_page
 from .report.series_table import SeriesTable as SeriesTable
 from .run.carry import CarriedLandmarks as CarriedLandmarks
 from .run.carry import carry_landmarks as carry_landmarks

@@ -42,7 +42,10 @@ def mesh(of: Shape) -> js.ControlMesh:
         first = len(vertices)
         vertices.append((0, 0, of.base - c))
         for angle in np.pi / 2 * np.arange(1, UP + 1) / UP:
-            vertices += [(a * np.sin(angle) * np.cos(t), a * np.sin(angle) * np.sin(t), of.base - c * np.cos(angle)) for t in turns]
+            vertices += [
+                (a * np.sin(angle) * np.cos(t), a * np.sin(angle) * np.sin(t), of.base - c * np.cos(angle))
+                for t in turns
+            ]
         for i in range(AROUND):
             j, ring = (i + 1) % AROUND, first + 1
             # The outside is wound outwards, the lining towards the cavity.

@@ -8,6 +8,7 @@ from jaxsubdiv.console import lasting_streams, plain_warnings
 
 from ..run.names import name_folder
 from ..run.surface_files import check_formats
+from .frames import fit_frames
 from .inputs import find_sources
 from .many import fit_all
 from .messages import report_failure
@@ -31,6 +32,10 @@ def _main(arguments: Sequence[str] | None) -> int:
         parser.error("labels are those of a scan: give SCAN before --labels, which takes all the words that follow")
     if options.carry and not options.control:
         parser.error("--carry takes landmarks of a template to the scan: give the template, --control MESH")
+    if not options.series and (options.periodic or options.valves):
+        parser.error("--periodic and --valves are of frames: give --series")
+    if options.series and not options.control:
+        parser.error("--series fits a template to all frames: give --control MESH")
     keep_compiled_programs()
     try:
         check_options(options)
@@ -39,6 +44,8 @@ def _main(arguments: Sequence[str] | None) -> int:
     except (ValueError, OSError, ImportError) as error:
         return report_failure(error)
     try:
+        if options.series:
+            return fit_frames(scans, options, recipe)
         if len(scans) > 1:
             return fit_all(scans, options, recipe)
         scan = scans[0] if scans else None

@@ -76,6 +76,19 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="JSON, label of the scan: group of the template's faces; default: by the names",
     )
+    add(
+        "--series",
+        action="store_true",
+        help="the scans are frames of one anatomy in the order of their names: fitted at once, with --control, one "
+        "shift a slice; OUT gets series.csv, series.html, series.gif, and frames/ with the surface of each",
+    )
+    add("--periodic", action="store_true", help="of --series: the first frame follows the last, as in a heartbeat")
+    add(
+        "--valves",
+        nargs="+",
+        metavar="GROUP",
+        help="of --series: the template's groups that close cavities; default: those whose names hold VALVE",
+    )
     add("--label", metavar="LABEL", help="of a label map: a value, a name, or `all`, a fit each; default: the only one")
     add(
         "--above", type=float, metavar="VALUE", help="of a grey image: the value at the surface, which is lower outside"

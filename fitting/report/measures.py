@@ -12,7 +12,6 @@ import jaxsubdiv as js
 from jaxsubdiv.linalg import cross, norm
 
 from ..scan.closest_points import closest_points
-from ..scan.regions import Choice
 from ..start.cavities import Part, find_parts
 
 DENSITY = 1.05  # g/ml, of heart muscle
@@ -62,9 +61,7 @@ class Measures:
         self.parts: tuple[Part, ...] = find_parts(refined, valves)
         self.triangles = refined_triangles(surface, np.ones(len(owner), bool))
         self._tables = [
-            _PartTables(
-                refined_triangles(surface, part.faces), tuple((rim, np.roll(rim, -1)) for rim in part.rims)
-            )
+            _PartTables(refined_triangles(surface, part.faces), tuple((rim, np.roll(rim, -1)) for rim in part.rims))
             for part in self.parts
         ]
         self.is_closed = refined.is_closed
@@ -96,7 +93,7 @@ class Measures:
             triangles = self._tables[i].triangles
             vertices = np.unique(triangles)
             others = np.any([part.faces for j, part in enumerate(self.parts) if j != i], axis=0)
-            choice = Choice(np.zeros(len(vertices), np.int32), others[None])
+            choice = js.FaceChoice(np.zeros(len(vertices), np.int32), others[None])
             x = np.asarray(surface.vertices)
             at = closest_points(surface, surface.vertices[vertices], choice)
             corners, weights = js.corner_weights(surface, at)

@@ -35,7 +35,7 @@ def draw_fit(result: FitResult, start: js.ControlMesh, *, title: str = "", slice
     Raises:
         ImportError: matplotlib is missing; it comes with the extra `viz`.
     """
-    figure = _make_figure(15.0, 14.25 if slices else 9.5)
+    figure = make_figure(15.0, 14.25 if slices else 9.5)
     figure.suptitle(printable(title), fontsize=14, parse_math=False)  # a `$` in a name is no formula
     (before, after, smooth), (error, counts, convergence), *below = figure.subplots(3 if slices else 2, 3)
     view, surface = js.view_of(result.surface), result.surface
@@ -64,7 +64,7 @@ def draw_slices(result: FitResult, slices: Sequence[Slice]) -> "Figure":
     Raises:
         ImportError: matplotlib is missing; it comes with the extra `viz`.
     """
-    figure = _make_figure(15.0, 5.0)
+    figure = make_figure(15.0, 5.0)
     for ax, one in zip(figure.subplots(1, len(slices)), slices, strict=True):
         _draw_slice(ax, one, result.surface)
     return figure
@@ -77,7 +77,7 @@ def as_png(figure: "Figure") -> bytes:
     return file.getvalue()
 
 
-def _make_figure(width: float, height: float) -> "Figure":
+def make_figure(width: float, height: float) -> "Figure":
     try:
         from matplotlib.figure import Figure
     except ImportError as error:

@@ -40,7 +40,7 @@ _FIT, _RECIPE = "fit.npz", "recipe.json"
 _ENDS = ("successful", "nonlinear_max_steps_reached", "nonlinear_divergence", "nonfinite")
 _OF_SCAN = ("points", "normals", "weights", "deviations", "slices")
 _MOST_FACES = 1 << 23  # of a refined surface; a fit of as many takes 25 GB
-_TUPLES: dict[str, Any] = {"frames": Frames, "valves": ValvePoints}
+_OF_SERIES: dict[str, Any] = {"frames": Frames, "valves": ValvePoints, "slices": SlicePlanes}
 _A_POINT = ("face", "uv", "directions", "distances", "weights", "precisions")
 
 
@@ -105,8 +105,8 @@ def save_fit(
         arrays["symmetry_partner"] = inputs["symmetry"].partner
     if inputs.get("boundary") is not None:
         arrays |= {f"boundary_{name}": value for name, value in inputs["boundary"]._asdict().items()}
-    for name, kind in _TUPLES.items():
-        if inputs.get(name) is not None:
+    for name, kind in _OF_SERIES.items():
+        if inputs.get("frames") is not None and inputs.get(name) is not None:
             arrays |= {f"{name}_{field}": getattr(inputs[name], field) for field in kind._fields}
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -260,14 +260,14 @@ def _restore(arrays: dict[str, np.ndarray]) -> Fit:
         inputs["symmetry"] = symmetry_of(arrays["symmetry_partner"], arrays["template"])
     if "boundary_points" in arrays:
         inputs["boundary"] = BoundaryCurve(arrays["boundary_points"], float(arrays["boundary_deviation"]))
-    for name, kind in _TUPLES.items():
+    for name, kind in _OF_SERIES.items():
         if f"{name}_{kind._fields[0]}" in arrays:
             inputs[name] = kind(*(arrays[f"{name}_{field}"] for field in kind._fields))
     frames: Frames | None = inputs.get("frames")
     if frames is not None and frames.counts.sum() != scan.n_points:
         raise ValueError(f"'frames_counts' are of {frames.counts.sum()} points; the scan has {scan.n_points}.")
-    if settings.free.shifts:
-        inputs["slices"] = find_slice_planes(scan if frames is None else frames.in_place(scan))
+    if settings.free.shifts and frames is None:
+        inputs["slices"] = find_slice_planes(scan)
     of_fit = scheme, topology, start, settings.free, settings.priors
     model, first = analyse(*of_fit, inputs)
     if int(arrays["version"]) == 3 and (alike := _expected_faces(arrays, model)) is not None:

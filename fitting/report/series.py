@@ -70,9 +70,7 @@ class SeriesFit:
     def control_mesh(self, frame: int) -> js.ControlMesh:
         """The control mesh of a frame with its normals and groups, for `js.write_mesh`."""
         control, template = self.control(frame), self.template
-        return js.ControlMesh(
-            control.vertices, template.faces, control.normals, check=False, regions=template.regions
-        )
+        return js.ControlMesh(control.vertices, template.faces, control.normals, check=False, regions=template.regions)
 
     def topology(self, levels: int | None = None) -> js.Topology:
         """Tables of the control mesh of one frame; default: with as many levels as the fit has."""
@@ -150,7 +148,7 @@ def load_series(folder: str | os.PathLike[str]) -> SeriesFit:
     path = Path(folder) / _SERIES
     if not path.is_file():
         raise FileNotFoundError(f"{folder} has no {_SERIES}: it is not the folder of a series that was saved.")
-    fit, recipe = load_fit(folder)
+    fit, _ = load_fit(folder)
     try:
         told: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         names, valves = (tuple(map(str, told[name])) for name in ("names", "valves"))

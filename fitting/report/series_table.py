@@ -1,7 +1,7 @@
 """The table of a series: every measure of every frame, with its standard deviation from the posterior.
 
-To first order a measure is Gaussian about that of the fit. Its variance is the derivative of the measure by the unknowns
-of its frame, through the covariance of all frames together.
+To first order a measure is Gaussian about that of the fit. Its variance follows from the derivative of the measure by
+the unknowns of its frame, and from the covariance of the unknowns of all frames.
 """
 
 import csv
@@ -103,7 +103,9 @@ def measure_series(
 
     def refine(vector: Float[Array, "n"], y: Variables) -> js.RefinedSurface:
         moved = own.retract(y, own.split(vector), edge)
-        scheme = result.scheme if "h" not in moved.shared else eqx.tree_at(lambda s: s.h, result.scheme, moved.shared["h"])
+        scheme = (
+            result.scheme if "h" not in moved.shared else eqx.tree_at(lambda s: s.h, result.scheme, moved.shared["h"])
+        )
         return js.refine(scheme, topology, moved.control)
 
     def of_frame(vector: Float[Array, "n"], y: Variables, walls: list[Walls]) -> Float[Array, "m"]:

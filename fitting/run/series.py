@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 import jaxsubdiv as js
 from jaxsubdiv.notices import warn
@@ -131,7 +131,7 @@ def fit_series(
     model, y = analyse(scheme, tables, control, free, priors, inputs)
     y = _start_at(pilot, y, frames)
     scene = make_scene(scan, model.refine(y), inputs["slices"], choose_faces(match, model, y, scan))
-    strengths = FromPilot(_targets(pilot, model, topology.control_faces[3], n))
+    strengths = FromPilot(_targets(pilot, model, n))
     solver = make_solver(model, y, scene, None, loss, tolerance, max_sweeps, strengths)
     subject = Subject(model, scene)
     state = solver.init(subject_residual, y, subject, {}, None, None, frozenset())
@@ -203,10 +203,11 @@ def _common_motion(result: FitResult) -> Float[np.ndarray, "3"]:
     return np.linalg.lstsq(planes, np.asarray(result.fit.y.shared["shifts"], np.float64).ravel(), rcond=1e-3)[0]
 
 
-def _targets(pilot: FitResult, model: Model, triangles: Int[np.ndarray, "t 3"], n: int) -> FromTargets:
+def _targets(pilot: FitResult, model: Model, n: int) -> FromTargets:
     """The strengths of one frame's priors for all frames."""
     found = pilot.fit.strengths
-    n_faces = pilot.fit.topology.n_control_faces
+    topology = pilot.fit.topology
+    n_faces, triangles = topology.n_control_faces, np.asarray(topology.control_faces[3])
     values = {}
     for prior in model.priors:
         if not prior.n_strengths:

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 import jaxsubdiv as js
+from jaxsubdiv.closest import AnyArray
 
-from .closest_points import AnyArray
 from .scan import Scan, ScanError
 
 _APART = 2.0  # of the size of all scans together

@@ -1,4 +1,4 @@
-"""Strengths of priors that a pilot fit found, for one fit of many frames; what ties the frames is found by it itself."""
+"""Strengths of priors for a fit of many frames: those that a pilot fit found, and that of the tie between frames."""
 
 from collections.abc import Callable
 

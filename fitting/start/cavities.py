@@ -58,7 +58,9 @@ def find_parts(mesh: js.ControlMesh, valves: Sequence[str]) -> tuple[Part, ...]:
         rims = _loops(sides.start[alone], sides.end[alone])
         names = [name for name in dict.fromkeys(words[faces].tolist()) if name]
         volume = _closed_volume(mesh, faces, rims)
-        found.append(Part("+".join(names) or "surface", faces, bool(rims) and not mesh_is_open(mesh) and volume < 0, rims))
+        found.append(
+            Part("+".join(names) or "surface", faces, bool(rims) and not mesh_is_open(mesh) and volume < 0, rims)
+        )
     return tuple(found)
 
 

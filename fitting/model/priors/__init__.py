@@ -70,8 +70,8 @@ class Priors(eqx.Module):
             to this one (`Modes`), or a `ShapeModes`: where the scan lacks something, it is filled by scores along the
             modes that the rest of the scan shows. Default: left out.
         shift: of how far breathing displaced a slice of the scan, in mm, along each of two axes of the slice's plane.
-        frame_change: of how far a control vertex moves from one frame of a series to the next, in mm, in each coordinate; see
-            `fit_series`. None, the default: found from the scans.
+        frame_change: of how far a control vertex moves from one frame of a series to the next, in mm, in each
+            coordinate; see `fit_series`. None, the default: found from the scans.
 
     Raises:
         ValueError: a standard deviation is not positive, or the likeness not from 0 to 1.
@@ -87,5 +87,7 @@ class Priors(eqx.Module):
     shape: ShapeModes | None = eqx.field(converter=ShapeModes.of, default=None)
 
     def __check_init__(self):
-        check_numbers({name: getattr(self, name) for name in ("bend", "stretch", "symmetry", "shift", "frame_change", "likeness")})
+        check_numbers(
+            {name: getattr(self, name) for name in ("bend", "stretch", "symmetry", "shift", "frame_change", "likeness")}
+        )
         check_numbers({"h of priors": self.h})

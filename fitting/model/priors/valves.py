@@ -8,10 +8,10 @@ import scipy.sparse as sp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsubdiv.closest import triangle_distance
 from jaxsubdiv.half_edges import half_edges
 from jaxsubdiv.linalg import cross, dot, take, unit
 
-from ...scan.closest_points import triangle_distance
 from ..unknowns import AnyArray
 from .base import AbstractFacePrior, Place, Start
 

@@ -1,0 +1,92 @@
+"""A series of the command: all its frames in one fit, and its files."""
+
+import argparse
+import time
+from pathlib import Path
+
+import jaxsubdiv as js
+
+from ..report.animation import animate_series
+from ..report.series import SeriesFit
+from ..report.series_page import write_series_page
+from ..run.folder import ANIMATION, PAGE_OF_SERIES, TABLE_OF_SERIES, filling, working_in
+from ..run.names import name_folders
+from ..run.recipe import Recipe
+from ..run.series import fit_series
+from .inputs import Source, read_inputs
+from .messages import print_regions, print_warnings, report_failure
+from .progress import Progress
+
+_FRAMES = "frames"
+_REFUSALS = (js.MeshError, ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError)
+# Options that a series has no use for, and their values where they are not given.
+_UNUSED = {"tolerance": None, "points": None, "boundary": None, "landmarks": None, "carry": None, "mirror": False}
+_UNUSED |= {"resume": False, "symmetry": None}
+
+
+def fit_frames(scans: list[Source], options: argparse.Namespace, recipe: Recipe) -> int:
+    """All frames in one fit: exit status 0, 1 for one not to be trusted, 2 for one that failed."""
+    folder = Path(options.output or "series")
+    try:
+        for name, usual in _UNUSED.items():
+            if getattr(options, name) != usual:
+                raise ValueError(f"--{name} is not of a series: leave it out.")
+        with working_in(folder):
+            return _fit_and_save(scans, folder, options, recipe)
+    except _REFUSALS as error:
+        return report_failure(error)
+
+
+def _fit_and_save(scans: list[Source], folder: Path, options: argparse.Namespace, recipe: Recipe) -> int:
+    began = time.perf_counter()
+    names = name_folders([scan.as_file for scan in scans])
+    jobs = [read_inputs(scan, options, recipe) for scan in scans]
+    for name, job in zip(names, jobs, strict=True):
+        print(f"frame    {name}: {job.scan.n_points:,} points")
+    mesh = jobs[0].mesh
+    assert mesh is not None
+    print_regions(jobs[0].scan, mesh, jobs[0].regions)
+    with Progress(recipe.max_sweeps) as progress:
+        found = fit_series(
+            [job.scan for job in jobs],
+            mesh,
+            names=names,
+            periodic=options.periodic,
+            scheme=recipe.scheme,
+            levels=2 if options.levels is None and options.recipe is None else recipe.levels,
+            pose=recipe.pose,
+            regions=jobs[0].regions,
+            valves=options.valves,
+            free=recipe.free,
+            priors=recipe.priors,
+            loss=recipe.loss,
+            max_sweeps=recipe.max_sweeps,
+            tolerance=recipe.tolerance,
+            throw=False,
+            on_stage=progress.stage,
+            on_sweep=progress.update,
+        )
+    print(f"done     in {time.perf_counter() - began:.1f} s\n\n{found.table}\n")
+    _save(folder, found)
+    print_warnings(found.result)
+    return 0 if found.result.trusted else 1
+
+
+def _save(folder: Path, found: SeriesFit) -> None:
+    """The series as files, all of them in place of those of an earlier one, or none; and those of every frame."""
+    frames = folder / _FRAMES
+    frames.mkdir(exist_ok=True)
+    for number, name in enumerate(found.names):
+        js.write_mesh(frames / f"{name}.obj", found.control_mesh(number), frame=found.result.scan.frame)
+        js.write_mesh(frames / f"{name}.ply", found.surface(number), frame=found.result.scan.frame)
+    with filling(folder) as new:
+        found.save(new)
+        found.table.write_csv(new / TABLE_OF_SERIES)
+        animation = None
+        try:
+            animation = animate_series(found)
+            (new / ANIMATION).write_bytes(animation)
+        except ImportError as error:
+            print(f"note     no animation: {error}")
+        write_series_page(new / PAGE_OF_SERIES, found, title=folder.name, animation=animation)
+    print(f"wrote    the series, and {_FRAMES}/ with the control mesh and surface of every frame, in {folder}")
