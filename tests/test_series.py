@@ -201,7 +201,8 @@ def write_frames(folder, scans, template):
 
 
 @pytest.mark.usefixtures("command_settings")
-def test_the_command_fits_a_folder_of_frames(found, truth, tmp_path, capsys):
+def test_the_command_fits_a_folder_of_frames(found, truth, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("fitting.report.animation._PICTURES", 2 * N)
     arguments = write_frames(tmp_path / "frames", truth[1], truth[2])
     out = tmp_path / "out"
     assert command([*arguments, "--periodic", "--max-sweeps", "2", "-o", str(out)]) == 1
@@ -220,7 +221,7 @@ def test_the_command_fits_a_folder_of_frames(found, truth, tmp_path, capsys):
     page = (out / "series.html").read_text(encoding="utf-8")
     assert page.count("<svg") == 5 and "data:image/gif;base64," in page and page.count("<tr>") == N + 1
     image = pytest.importorskip("PIL.Image").open(io.BytesIO((out / "series.gif").read_bytes()))
-    assert image.n_frames == 24
+    assert image.n_frames == 2 * N
 
 
 @pytest.mark.usefixtures("command_settings")

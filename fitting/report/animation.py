@@ -3,6 +3,7 @@
 import io
 from typing import TYPE_CHECKING, Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
@@ -71,7 +72,8 @@ def _cavities(series: SeriesFit, surface: js.RefinedSurface) -> list[js.RefinedS
         return []
     chosen, t = np.any(parts, axis=0), len(surface.faces[3])
     three, four = (np.asarray(surface.faces[k])[:, ::-1] for k in (3, 4))
-    return [js.RefinedSurface(surface.vertices, -surface.normals, {3: three[chosen[:t]], 4: four[chosen[t:]]})]
+    faces = {3: jnp.asarray(three[chosen[:t]]), 4: jnp.asarray(four[chosen[t:]])}
+    return [js.RefinedSurface(surface.vertices, -surface.normals, faces)]
 
 
 def _draw(

@@ -5,7 +5,7 @@ the own frame. Nothing else depends on where a frame lies.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -72,7 +72,9 @@ def place_frames(scans: Sequence[Scan], periodic: bool) -> tuple[Scan, Frames]:
     frames = Frames(
         np.ceil(_APART * size) * places.astype(float), np.array([scan.n_points for scan in scans]), periodic
     )
-    parts = {name: _join(name, [getattr(scan, name) for scan in scans]) for name in ("normals", "deviations", "slices")}
+    parts: dict[str, Any] = {
+        name: _join(name, [getattr(scan, name) for scan in scans]) for name in ("normals", "deviations", "slices")
+    }
     weights = None
     if any(scan.weights is not None for scan in scans):
         weights = np.concatenate([np.asarray(scan.weights_or_ones()) for scan in scans])

@@ -1,6 +1,7 @@
 """Strengths of priors for a fit of many frames: those that a pilot fit found, and that of the tie between frames."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 
@@ -34,7 +35,7 @@ class FromPilot(eqx.Module):
         step: AnyArray,
         solve_prior: Callable[[], Solve],
         solve_posterior: Callable[[], Solve],
-        xp: object,
+        xp: Any,
     ) -> Strengths:
         """Those of the next sweep; see `FromScan.update`."""
         new = self.targets.update(model, strengths, xp)
