@@ -120,6 +120,15 @@ def test_is_saved_and_read_again(found, tmp_path):
         fitting.load_series(tmp_path)
 
 
+def test_the_prior_is_of_the_change_from_frame_to_frame(found):
+    """Of the last to the first too; where the frames were placed does not count."""
+    model = found.result.fit.model
+    rows = model.prior("series").rows(model.place(found.result.fit.y), None).reshape(N, -1, 3)
+    controls = [np.asarray(found.control(k).vertices) for k in range(N)]
+    changes = [controls[j] - controls[i] for i, j in ((0, 1), (1, 2), (2, 3), (3, 0))]
+    np.testing.assert_allclose(rows, changes, atol=1e-9)
+
+
 def test_a_beat_closes_and_a_growth_does_not(truth):
     """The last frame is tied to the first where the series is periodic, and there alone."""
     _, frames = place_frames(truth[1], True)
@@ -219,7 +228,7 @@ def test_the_command_fits_a_folder_of_frames(found, truth, tmp_path, capsys, mon
     assert [row["frame"] for row in rows] == list(again.names)
     assert float(rows[0]["volume ENDO [ml]"]) > float(rows[2]["volume ENDO [ml]"]) > 0
     page = (out / "series.html").read_text(encoding="utf-8")
-    assert page.count("<svg") == 5 and "data:image/gif;base64," in page and page.count("<tr>") == N + 1
+    assert page.count("<svg") == 6 and "data:image/gif;base64," in page and page.count("<tr>") == N + 1
     image = pytest.importorskip("PIL.Image").open(io.BytesIO((out / "series.gif").read_bytes()))
     assert image.n_frames == 2 * N
 
