@@ -23,7 +23,8 @@ from ._search_nearest import search_nearest
 from ._surface import RefinedSurface, SurfacePoint, evaluate
 from .linalg import cross, dot, norm, take, unit
 
-_Arguments, _Result = ParamSpec("_Arguments"), TypeVar("_Result")
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
 
 
 def _of_each(quantity: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
