@@ -12,7 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Shaped
 
 from ._admissible import corner_cosines
 from ._curvature import curvatures
@@ -23,7 +23,8 @@ from ._search_nearest import search_nearest
 from ._surface import RefinedSurface, SurfacePoint, evaluate
 from .linalg import cross, dot, norm, take, unit
 
-_Arguments, _Result = ParamSpec("_Arguments"), TypeVar("_Result")
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
 
 
 def _of_each(quantity: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
@@ -52,7 +53,7 @@ def _of_each(quantity: Callable[_Arguments, _Result]) -> Callable[_Arguments, _R
     return of_each
 
 
-def _mean(rows: Float[Array, "p"], weights: Float[Array, "p"] | None) -> Float[Array, ""]:
+def _mean(rows: Float[Array, "p"], weights: Shaped[Array, "p"] | None) -> Float[Array, ""]:
     """Weighted mean; 0 where the weights are all 0."""
     if weights is None:
         return jnp.mean(rows)
@@ -207,13 +208,14 @@ def inverted_faces(surface: RefinedSurface, *, margin: float = 0.05) -> Float[Ar
 
     cos is that between the normal at the vertex and the face's own normal at this corner, `corner_cosines`. Of a
     control mesh, `RefinedSurface(control.vertices, control.normals, topology.control_faces)`, it keeps the normals
-    admissible: the surface is smooth where every cosine is above 0.05.
+    admissible: the surface is smooth where every cosine is above 0.05. Corners that have no normal are left out.
 
     Args:
         surface: triangles, quads or both.
         margin: the cosine from which on a corner costs nothing.
     """
-    return jnp.mean(jnp.maximum(margin - corner_cosines(surface.vertices, surface.normals, surface.faces), 0.0) ** 2)
+    cosines = corner_cosines(surface.vertices, surface.normals, surface.faces)
+    return _mean(jnp.maximum(margin - cosines, 0.0) ** 2, cosines != 0)
 
 
 def edge_lengths(vertices: Float[Array, "*batch v 3"], edges: Int[Array, "e 2"]) -> Float[Array, "*batch e"]:

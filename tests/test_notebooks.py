@@ -4,6 +4,7 @@ import json
 import re
 from pathlib import Path
 
+import jax
 import matplotlib.pyplot as plt
 import pytest
 
@@ -31,6 +32,13 @@ def test_there_are_notebooks():
 def test_runs_from_top_to_bottom(path, monkeypatch, tmp_path):
     if path.stem in NEEDS:
         pytest.importorskip(NEEDS[path.stem])
+        with jax.numpy_dtype_promotion("standard"):  # optimisers multiply floating numbers by whole ones
+            _run(path, monkeypatch, tmp_path)
+    else:
+        _run(path, monkeypatch, tmp_path)
+
+
+def _run(path, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     plt.switch_backend("Agg")
     names: dict = {"__name__": "__main__"}
