@@ -115,8 +115,6 @@ def fit_series(
 
     scan, frames = place_frames(scans, periodic)
     n = len(scans)
-    # One anatomy departs from the template once, and not in every frame anew.
-    told["priors"] = priors = dataclasses.replace(priors, stretch=priors.stretch * n**0.5)
     say(f"fits {n} frames, {n * len(mesh.vertices):,} control vertices")
     whole = copy_mesh(mesh, frames)
     tables = js.build_topology(js.ControlMesh(whole.vertices, whole.faces), scheme, levels)
