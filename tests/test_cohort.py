@@ -11,6 +11,7 @@ import scans
 
 import fitting
 import jaxsubdiv as js
+from fitting.run.pilot import is_its_own_start
 
 N_SUBJECTS, SIZES = 3, (600, 500, 550)
 PRIORS = fitting.Priors(bend=0.5)
@@ -138,11 +139,57 @@ def test_result_is_that_of_a_fit(tmp_path):
 
 
 def test_smoothness_is_that_of_the_pilot():
-    problem = scans.problem()
-    pilot = fitting.fit(js.Interpolating(), problem.topology, start(), subjects()[0], throw=False)
-    found = fitted(priors=None, pilot=pilot)
+    found = fitted(priors=None, pilot=pilot())
     assert found.converged.all()
-    assert off(pilot.surface, surface(found, 0)) < 0.3 * off(truths()[0], pilot.surface)
+    assert off(pilot().surface, surface(found, 0)) < 0.3 * off(truths()[0], pilot().surface)
+
+
+@functools.cache
+def pilot() -> fitting.FitResult:
+    return fitting.fit(js.Interpolating(), scans.problem().topology, start(), subjects()[0], throw=False)
+
+
+def test_a_pilot_that_is_its_own_start_is_replaced():
+    """Its strengths would say that no subject differs from the first, and hold all at its shape."""
+    topology, control = scans.problem().topology, pilot().control
+    own = fitting.fit(js.Interpolating(), topology, control, subjects()[0], throw=False)
+    assert is_its_own_start(own) and not is_its_own_start(pilot())
+    with pytest.warns(UserWarning, match="fitted to the pilot's own scan before.*that of scan 2 was taken instead"):
+        found = fitting.fit_cohort(
+            js.Interpolating(), topology, control, subjects(), pilot=own, max_sweeps=40, tolerance=0.01
+        )
+    assert found.converged.all()
+    for i in range(N_SUBJECTS):
+        assert off(truths()[i], surface(found, i)) < 0.5
+
+
+def test_a_subject_that_the_priors_hold_far_off_has_not_converged():
+    flat = np.array([1.4, 0.6, 1.0])
+    chosen = [subjects()[0], *(fitting.Scan(np.asarray(scan.points) * flat) for scan in subjects()[1:])]
+    with pytest.warns(UserWarning, match="of the scans 1, 2"):
+        found = fitting.fit_cohort(
+            js.Interpolating(),
+            scans.problem().topology,
+            cohort().result(0).control,
+            chosen,
+            priors=fitting.Priors(bend=1e-7, stretch=1e-7),
+            max_sweeps=40,
+            tolerance=0.01,
+        )
+    np.testing.assert_array_equal(found.converged, [True, False, False])
+    assert "rests_where_it_started" in [finding.name for finding in found.warnings[1]]
+    assert not found.trusted[1:].any()
+    report = found.result(2).report()
+    assert not report.converged and report.reason == "at rest where it started, far from the scan"
+
+
+def test_every_subject_has_the_warnings_of_a_fit():
+    found = cohort()
+    single = fitting.fit(
+        js.Interpolating(), scans.problem().topology, start(), subjects()[0], priors=PRIORS, tolerance=0.01, throw=False
+    )
+    assert [finding.name for finding in found.warnings[0]] == [finding.name for finding in single.warnings]
+    np.testing.assert_array_equal(found.trusted, [not of_one for of_one in found.warnings])
 
 
 def test_every_prior_holds_as_in_a_fit():
@@ -199,6 +246,35 @@ def test_boundary_curves_hold_as_in_a_fit():
         outside = np.abs(own[:, :2] - 10).max(axis=1) > 5  # on the boundary, along which control vertices slide
         for rows in (own, others):
             np.testing.assert_allclose(np.abs(rows[outside, :2] - 10).max(axis=1), 11, atol=0.05)
+
+
+def test_points_are_paired_within_their_regions():
+    """A plate whose walls lie nearer each other than the start lies to them: labels alone tell upper from lower."""
+    corners = [(1, 0, 0), (0, 1, 0), (-1, 0, 0), (0, -1, 0), (0, 0, 0.1), (0, 0, -0.1)]
+    faces = [(0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4), (1, 0, 5), (2, 1, 5), (3, 2, 5), (0, 3, 5)]
+    walls = js.Regions(np.repeat([0, 1], 4), ("upper", "lower"))
+    mesh = js.ControlMesh(10 * np.array(corners), faces, regions=walls)
+    topology = js.build_topology(mesh, js.Interpolating(), 1)
+    rng = np.random.default_rng(0)
+    flat = rng.uniform(-4, 4, (400, 2))
+    chosen = []
+    for shift in (1.0, 1.2):  # the lower wall is nearer to where the upper one starts
+        height = np.where(np.arange(400) < 200, shift + 0.5, shift - 0.5) + rng.normal(scale=0.05, size=400)
+        labels = js.Regions(np.repeat([0, 1], 200), ("upper", "lower"))
+        chosen.append(fitting.Scan(np.column_stack([flat, height]), regions=labels))
+    chosen[1] = chosen[1].rows(np.arange(10, 400))
+    match = fitting.match_regions(chosen[0], mesh)
+    found = fitting.fit_cohort(
+        js.Interpolating(), topology, mesh.control(), chosen, priors=PRIORS, regions=[match, match]
+    )
+    for i, scan in enumerate(chosen):
+        result = found.result(i)
+        owner = js.control_faces_of(result.scheme, topology, result.surface, result.control)
+        np.testing.assert_array_equal(walls.rows[owner[result.at.face]], scan.regions.rows)
+        assert np.median(np.abs(result.distances)) < 0.25  # of walls 1 mm apart
+        assert [one.region for one in result.report().regions] == ["upper", "lower"]
+    with pytest.raises(ValueError, match="`regions` are of 8 control faces, and the topology has"):
+        fitted(regions=match)
 
 
 def test_bad_scans_are_named(as_users_run):

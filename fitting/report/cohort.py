@@ -1,6 +1,7 @@
 """What `fit_cohort` returns: many fits of one control mesh, and each of them as `fit` gives it."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import final
 
@@ -9,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 import jaxsubdiv as js
 
+from ..finding import Finding
 from ..scan.scan import Scan
 from .record import Fit
 from .result import FitResult
@@ -23,12 +25,14 @@ class Cohort:
         control: control vertices (mm) and unit normals `[s, v, 3]`.
         h: the fitted tangent length coefficients, one row a scan; None where the scheme has none.
         surfaces: vertices and normals `[s, w, 3]` of the refined surfaces; the faces are those of all.
-        converged: which fits came to rest. The others are what there was when the sweeps ran out or went astray.
+        converged: which fits came to rest, and not where they started far from the scan. The others are what there was
+            when the sweeps ran out or went astray.
         sweeps: how many each took.
         rms, robust_rms: as in `FitResult`, at the start and after every sweep; NaN beyond the last.
         noise: standard deviation of the Gaussian part of each scan's distances, in mm.
         weights: how much each point counts at the end, `[s, p]`; 0 past a scan's last point.
         scans: what was fitted.
+        names: of the scans, for files; default: their numbers.
     """
 
     control: js.Control
@@ -41,6 +45,7 @@ class Cohort:
     noise: Float[np.ndarray, "s"]
     weights: Float[np.ndarray, "s p"]
     scans: tuple[Scan, ...]
+    names: tuple[str, ...]
     _fits: Callable[[int], Fit]
 
     def __len__(self) -> int:
@@ -49,3 +54,13 @@ class Cohort:
     def result(self, i: int) -> FitResult:
         """The fit of scan `i` as `fit` gives it, with report, uncertainty and `save`; made when it is asked for."""
         return FitResult(self._fits(i))
+
+    @functools.cached_property
+    def warnings(self) -> tuple[tuple[Finding, ...], ...]:
+        """What speaks against the fit of each scan, as `FitResult.warnings` has it; made when first asked for."""
+        return tuple(tuple(self.result(i).warnings) for i in range(len(self)))
+
+    @property
+    def trusted(self) -> Bool[np.ndarray, "s"]:
+        """Which fits nothing speaks against."""
+        return np.array([not found for found in self.warnings])
