@@ -47,6 +47,7 @@ from .run.recipe import Recipe as Recipe
 from .run.recipe import fit as fit
 from .run.recipe import fit_scan as fit_scan
 from .run.recipe import load as load
+from .run.recipe import load_cohort as load_cohort
 from .run.recipe import load_recipe as load_recipe
 from .scan.closest_points import closest_points as closest_points
 from .scan.example import example as example

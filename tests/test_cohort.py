@@ -1,5 +1,6 @@
 """Many scans at once: each fit as a fit of its own, whatever the others are; and the modes of the shapes found."""
 
+import dataclasses
 import functools
 import warnings
 
@@ -138,6 +139,35 @@ def test_result_is_that_of_a_fit(tmp_path):
     np.testing.assert_array_equal(fitting.load(tmp_path).control.vertices, result.control.vertices)
 
 
+def test_a_cohort_that_was_saved_is_the_same(tmp_path):
+    named = dataclasses.replace(cohort(), names=("c", "a", "b"))
+    named.save(tmp_path)
+    again = fitting.load_cohort(tmp_path)
+    assert again.names == ("c", "a", "b")  # in their order, not that of the alphabet
+    for name in ("converged", "sweeps", "noise", "rms", "robust_rms", "weights"):
+        own, new = np.asarray(getattr(named, name)), np.asarray(getattr(again, name))
+        np.testing.assert_array_equal(own[..., : new.shape[-1]], new)
+    np.testing.assert_array_equal(again.control.vertices, named.control.vertices)
+    np.testing.assert_array_equal(again.h, named.h)
+    np.testing.assert_allclose(again.surfaces.vertices, named.surfaces.vertices, atol=1e-12)
+    np.testing.assert_array_equal(again.scans[2].points, subjects()[2].points)
+    assert again.warnings == named.warnings
+    (tmp_path / "cohort.json").unlink()
+    assert fitting.load_cohort(tmp_path).names == ("a", "b", "c")
+
+
+def test_what_is_no_saved_cohort_is_told(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no folders with saved fits"):
+        fitting.load_cohort(tmp_path)
+    (tmp_path / "cohort.json").write_text('{"names": ["../a"]}')
+    with pytest.raises(ValueError, match=r"cohort\.json: '\.\./a' cannot name a scan"):
+        fitting.load_cohort(tmp_path)
+    with pytest.raises(ValueError, match="fit 1 has another control mesh"):
+        fitting.Cohort.of([cohort().result(0), plates()[1].result(0)])
+    with pytest.raises(ValueError, match="one fit or more"):
+        fitting.Cohort.of([])
+
+
 def test_smoothness_is_that_of_the_pilot():
     found = fitted(priors=None, pilot=pilot())
     assert found.converged.all()
@@ -248,8 +278,9 @@ def test_boundary_curves_hold_as_in_a_fit():
             np.testing.assert_allclose(np.abs(rows[outside, :2] - 10).max(axis=1), 11, atol=0.05)
 
 
-def test_points_are_paired_within_their_regions():
-    """A plate whose walls lie nearer each other than the start lies to them: labels alone tell upper from lower."""
+@functools.cache
+def plates() -> tuple[fitting.RegionMatch, fitting.Cohort]:
+    """A plate whose lower wall lies nearer to where its upper one starts: labels alone tell upper from lower."""
     corners = [(1, 0, 0), (0, 1, 0), (-1, 0, 0), (0, -1, 0), (0, 0, 0.1), (0, 0, -0.1)]
     faces = [(0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4), (1, 0, 5), (2, 1, 5), (3, 2, 5), (0, 3, 5)]
     walls = js.Regions(np.repeat([0, 1], 4), ("upper", "lower"))
@@ -258,7 +289,7 @@ def test_points_are_paired_within_their_regions():
     rng = np.random.default_rng(0)
     flat = rng.uniform(-4, 4, (400, 2))
     chosen = []
-    for shift in (1.0, 1.2):  # the lower wall is nearer to where the upper one starts
+    for shift in (1.0, 1.2):
         height = np.where(np.arange(400) < 200, shift + 0.5, shift - 0.5) + rng.normal(scale=0.05, size=400)
         labels = js.Regions(np.repeat([0, 1], 200), ("upper", "lower"))
         chosen.append(fitting.Scan(np.column_stack([flat, height]), regions=labels))
@@ -267,10 +298,15 @@ def test_points_are_paired_within_their_regions():
     found = fitting.fit_cohort(
         js.Interpolating(), topology, mesh.control(), chosen, priors=PRIORS, regions=[match, match]
     )
-    for i, scan in enumerate(chosen):
+    return match, found
+
+
+def test_points_are_paired_within_their_regions():
+    match, found = plates()
+    for i, scan in enumerate(found.scans):
         result = found.result(i)
-        owner = js.control_faces_of(result.scheme, topology, result.surface, result.control)
-        np.testing.assert_array_equal(walls.rows[owner[result.at.face]], scan.regions.rows)
+        owner = js.control_faces_of(result.scheme, result.fit.topology, result.surface, result.control)
+        np.testing.assert_array_equal(match.faces.rows[owner[result.at.face]], scan.regions.rows)
         assert np.median(np.abs(result.distances)) < 0.25  # of walls 1 mm apart
         assert [one.region for one in result.report().regions] == ["upper", "lower"]
     with pytest.raises(ValueError, match="`regions` are of 8 control faces, and the topology has"):

@@ -28,7 +28,7 @@ from ..model.recipe import Settings
 from ..model.residual import Model, analyse
 from ..model.robust import AbstractLoss, geman_mcclure
 from ..model.unknowns import Free, Variables
-from ..report.cohort import Cohort
+from ..report.cohort import Cohort, name_subjects
 from ..report.evidence import rests_far_off
 from ..report.record import Fit, choose_faces
 from ..report.result import FitResult
@@ -63,6 +63,7 @@ def fit_cohort(
     symmetry: Symmetry | None = None,
     boundary: BoundaryCurve | Sequence[BoundaryCurve] | None = None,
     regions: RegionMatch | Sequence[RegionMatch | None] | None = None,
+    names: Sequence[str] | None = None,
     loss: AbstractLoss | None = None,
     max_sweeps: int = 60,
     tolerance: float = 0.1,
@@ -84,6 +85,7 @@ def fit_cohort(
         pilot: an ordinary fit of the same control mesh; default, where it is needed: that of the first scan. One whose
             start was fitted to its own scan is replaced.
         landmarks, boundary, regions: as in `fit`, one a scan; or one for all.
+        names: of the scans, for tables and folders; default: their numbers.
         landmark_deviation, symmetry: as in `fit`, for all; symmetry is by default that of the first control mesh.
         at_once: how many subjects share each operation, as the memory allows: on an accelerator many; on a CPU one at
             a time is as fast, and stops when it has converged.
@@ -115,6 +117,7 @@ def fit_cohort(
         if id(control) not in sound:
             sound[id(control)] = sound_start(scheme, topology, control, free)
     controls = [sound[id(control)] for control in controls]
+    named = name_subjects(n, names)
     places = [None] * n if landmarks is None else _one_each(landmarks, Landmarks, n, "landmarks")
     curves = [None] * n if boundary is None else _one_each(boundary, BoundaryCurve, n, "boundaries")
     matches = [None] * n if regions is None else _one_each(regions, RegionMatch, n, "regions")
@@ -195,8 +198,8 @@ def fit_cohort(
         noise=states.look.noise,
         weights=states.look.weights,
         scans=tuple(scans),
-        names=tuple(map(str, range(n))),
-        _fits=fit_of,
+        names=named,
+        _results=lambda i: FitResult(fit_of(i)),
     )
 
 
