@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 import warnings
 
 import jax.numpy as jnp
@@ -324,6 +325,31 @@ def test_bad_scans_are_named(as_users_run):
         fitted(())
     with pytest.raises(ValueError, match="2 scans and 1 controls"):
         fitting.fit_cohort(js.Interpolating(), scans.problem().topology, [start()], subjects()[:2])
+
+
+def test_landmarks_and_shapes_are_written(tmp_path):
+    template = js.ControlMesh(start().vertices, scans.problem().mesh.faces)
+    places = {"top": np.asarray(start().vertices)[0], "side": np.asarray(start().vertices)[3]}
+    carried = fitting.carry_to_cohort(template, cohort(), places)
+    for i, own in enumerate(carried):
+        np.testing.assert_allclose(own.points, np.asarray(cohort().control.vertices)[i, [0, 3]], atol=1e-6)
+        assert all(0 < deviation < 10 for deviation in own.deviations.values())
+    modes = fitting.shape_modes(cohort().surfaces.vertices)
+    quality = fitting.measure_modes(cohort().surfaces.vertices)
+    fitting.write_shapes(tmp_path, cohort(), modes, quality=quality, landmarks=carried)
+    with np.load(tmp_path / "shapes.npz") as arrays:
+        np.testing.assert_array_equal(arrays["scores"], modes.scores)
+        np.testing.assert_array_equal(arrays["landmarks"][2], carried[2].points)
+    rows = (tmp_path / "scores.csv").read_text().splitlines()
+    assert rows[0] == "name,converged,centroid_size_mm,mode_1,mode_2" and rows[2].startswith("1,1,")
+    assert len((tmp_path / "modes.csv").read_text().splitlines()) == 3
+    assert len((tmp_path / "landmarks.csv").read_text().splitlines()) == 7
+    mean = js.read_mesh(tmp_path / "mean.vtp")
+    np.testing.assert_array_equal(mean.vertices, modes.mean)
+    place = json.loads((tmp_path / "2.mrk.json").read_text())["markups"][0]["controlPoints"][0]["position"]
+    np.testing.assert_allclose(place, carried[2].points[0])
+    with pytest.raises(ValueError, match="the modes are of 3 shapes of 5 vertices"):
+        fitting.write_shapes(tmp_path, cohort(), fitting.shape_modes(np.random.default_rng(0).normal(size=(3, 5, 3))))
 
 
 # ------------------------------------------------------------------------------------------------------------- modes
