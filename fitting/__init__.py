@@ -54,7 +54,10 @@ from .run.recipe import fit_scan as fit_scan
 from .run.recipe import load as load
 from .run.recipe import load_cohort as load_cohort
 from .run.recipe import load_recipe as load_recipe
+from .run.regroup import Template as Template
+from .run.regroup import regroup as regroup
 from .run.shape_files import write_shapes as write_shapes
+from .run.template import make_template as make_template
 from .scan.closest_points import closest_points as closest_points
 from .scan.example import example as example
 from .scan.landmarks import Landmarks as Landmarks

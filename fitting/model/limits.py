@@ -38,6 +38,7 @@ _LIMITS = {
     "most_faces": _FACES,
     "most_points": _Limit("it is a whole number of points, from 4 on", 4, 2**53, whole=True),
     "at_once": _Limit("it is a whole number of subjects, from 1 on", 1, 2**53, whole=True),
+    "rounds": _Limit("it is a whole number of rounds, from 1 to 100", 1, 100, whole=True),
     "draws": _Limit("it is a whole number of shapes, from 2 to 10 million", 2, 1e7, whole=True),
     "n_permutations": _Limit("it is a whole number of divisions, from 1 to 10 million", 1, 1e7, whole=True),
     "landmark_deviation": _KNOWN_DEVIATION,
