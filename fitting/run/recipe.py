@@ -111,15 +111,26 @@ def load_cohort(folder: str | os.PathLike[str]) -> Cohort:
         ValueError: a file is damaged, or the fits do not have one control mesh; see `Cohort.of`.
     """
     folder = Path(folder)
+    names = find_fits(folder)
+    try:
+        return Cohort.of([load(folder / name) for name in names], names)
+    except ValueError as error:
+        raise ValueError(f"{folder}: {error}") from None
+
+
+def find_fits(folder: Path) -> tuple[str, ...]:
+    """The names of the folders with fits in a cohort's folder, in the cohort's order or that of the names.
+
+    Raises:
+        FileNotFoundError: there are none.
+        ValueError: the file of the cohort is damaged.
+    """
     names = _saved_names(folder / COHORT)
     if names is None:
         names = tuple(sorted(path.parent.name for path in folder.glob("*/fit.npz")))
     if not names:
         raise FileNotFoundError(f"{folder} has no folders with saved fits in it: it is not that of a cohort.")
-    try:
-        return Cohort.of([load(folder / name) for name in names], names)
-    except ValueError as error:
-        raise ValueError(f"{folder}: {error}") from None
+    return names
 
 
 def _saved_names(path: Path) -> tuple[str, ...] | None:
