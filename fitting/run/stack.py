@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+import jaxsubdiv as js
+
 from ..model.pairing import Scene
 from ..model.priors.landmarks import Anchors
 from ..model.priors.shifts import SlicePlanes
