@@ -29,6 +29,7 @@ from ._mesh import ControlMesh as ControlMesh
 from ._mesh import vector_areas as vector_areas
 from ._normals import estimate_normals as estimate_normals
 from ._refine import refine as refine
+from ._refine import refine_vertices as refine_vertices
 from ._regions import Regions as Regions
 from ._regions import as_regions as as_regions
 from ._saved_topology import load_topology as load_topology

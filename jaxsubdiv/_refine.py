@@ -42,6 +42,29 @@ def refine(scheme: AbstractScheme, topology: Topology, control: Control) -> Refi
     return RefinedSurface(vertices, normals, topology.faces)
 
 
+def refine_vertices(scheme: AbstractScheme, topology: Topology, control: Control) -> Float[Array, "w 3"]:
+    """The vertices of `refine` alone: what their normals cost is saved, outside of `jax.jit` too.
+
+    Args:
+        scheme: the rules and their `h`.
+        topology: tables from `build_topology`.
+        control: vertices `[v, 3]` in any unit, and normals `[v, 3]` of any length.
+
+    Returns:
+        The refined vertices, in the unit, the dtype and the order of those of `refine`.
+
+    Raises:
+        ValueError: as `refine`.
+    """
+    _check(scheme, topology, control)
+    return _refine_vertices(scheme, topology, control)
+
+
+@jax.jit
+def _refine_vertices(scheme: AbstractScheme, topology: Topology, control: Control) -> Float[Array, "w 3"]:
+    return _refine(scheme, topology, control)[0]
+
+
 @jax.jit
 def _refine(
     scheme: AbstractScheme, topology: Topology, control: Control
