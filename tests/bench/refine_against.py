@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).resolve().parents[2]
 
@@ -43,7 +44,7 @@ def works() -> tuple[dict[str, Callable[[], object]], dict[str, float]]:
     def in_single(mesh: js.ControlMesh) -> js.Control:
         return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), mesh.control())
 
-    def add(name: str, function: Callable, *arguments: object) -> Callable:
+    def add(name: str, function: Callable, *arguments: object) -> Any:
         compiled = jax.jit(function).lower(*arguments).compile()
         timed[name] = lambda: jax.block_until_ready(compiled(*arguments))
         return compiled
