@@ -92,7 +92,25 @@ def works() -> tuple[dict[str, Callable[[], object]], dict[str, float]]:
     controls = jax.tree.map(lambda leaf: jnp.stack([leaf] * 16), control)
     for work, function in functions(schemes[""]).items():
         add(f"batch of 16: {work}", jax.vmap(function, (None, 0)), topology, controls)
+    if hasattr(js, "pad_topology"):
+        counted["second mesh of a size class: programs compiled"] = compiled_for_second()
     return timed, counted
+
+
+def compiled_for_second() -> int:
+    """Programs compiled for a sheet of 17 x 15 cells, after a torus of 16 x 16 in the same class."""
+    import jax
+    import meshes
+
+    import jaxsubdiv as js
+
+    scheme, compiled = js.Interpolating(), []
+    refine = jax.jit(js.refine)
+    for mesh in (js.ControlMesh(*meshes.torus(16, 16)), js.ControlMesh(*meshes.grid(17, 15))):
+        topology = js.pad_topology(js.build_topology(mesh, scheme, 2))
+        refine(scheme, topology, js.pad_control(topology, mesh.control()))
+        compiled.append(refine._cache_size())
+    return compiled[1] - compiled[0]
 
 
 def serve(repository: str) -> None:
@@ -142,7 +160,8 @@ def main() -> None:
         mine, other = (statistics.median(column) for column in zip(*rounds, strict=True))
         print(f"| {name}, CPU ms | {1e3 * mine:.2f} | {1e3 * other:.2f} | {mine / other:.2f} |", flush=True)
     for name, value in ours.items():
-        print(f"| {name} | {value:.2f} | {theirs[name]:.2f} | {value / theirs[name] if theirs[name] else 1:.2f} |")
+        before = theirs.get(name)
+        print(f"| {name} | {value:.2f} | {before or '-'} | {value / before if before else '-'} |")
     for process in processes:
         process.terminate()
 
