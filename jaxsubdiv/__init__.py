@@ -12,6 +12,8 @@ from ._control_faces import control_edges as control_edges
 from ._control_faces import control_faces_of as control_faces_of
 from ._control_faces import splits_in_four as splits_in_four
 from ._creases import Creases as Creases
+from ._crossings import Crossings as Crossings
+from ._crossings import find_crossings as find_crossings
 from ._curvature import Curvatures as Curvatures
 from ._curvature import curvatures as curvatures
 from ._draw import draw_surface as draw_surface

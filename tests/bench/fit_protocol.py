@@ -18,6 +18,7 @@ from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
@@ -227,12 +228,9 @@ def judge(
 
 
 def crossing_faces(surface: Trimesh) -> float:
-    import pymeshlab
-
-    meshes = pymeshlab.MeshSet(verbose=False)
-    meshes.add_mesh(pymeshlab.Mesh(surface.vertices, surface.faces))
-    meshes.compute_selection_by_self_intersections_per_face()
-    return float(meshes.current_mesh().selected_face_number())
+    vertices = jnp.asarray(surface.vertices)
+    faces = {3: jnp.asarray(surface.faces, jnp.int32), 4: jnp.zeros((0, 4), jnp.int32)}
+    return float(len(js.find_crossings(js.RefinedSurface(vertices, jnp.zeros_like(vertices), faces)).triangles))
 
 
 def rms(values: np.ndarray) -> float:
