@@ -68,7 +68,6 @@ from .scan.regions import RegionMatch as RegionMatch
 from .scan.regions import match_regions as match_regions
 from .scan.scan import Scan as Scan
 from .scan.scan import ScanError as ScanError
-from .scan.search_closest import search_closest as search_closest
 from .solve.sparse_normal import SparseNormal as SparseNormal
 from .solve.sparse_normal import sparse_solver as sparse_solver
 from .solve.sweeps import Sweeps as Sweeps

@@ -1,5 +1,6 @@
 """`fit`: steps the solver `Sweeps` until the surface has come to rest, with progress and checkpoints."""
 
+import dataclasses
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -176,9 +177,11 @@ def fit(
             kept.write_tree((y, state))
     if kept is not None and not keep_checkpoint:
         kept.remove()
-    found = FitResult(
-        record_fit(model, y, state, scene, scan, control, inputs, Settings.of(scheme, topology, **settings), result)
-    )
+    told = Settings.of(scheme, topology, **settings)
+    record = record_fit(model, y, state, scene, scan, control, inputs, told, result)
+    if isinstance(solver.linear_solver, SparseNormal):
+        record = dataclasses.replace(record, structure=solver.linear_solver.structure)
+    found = FitResult(record)
     if throw and result != optx.RESULTS.successful:
         rms = found.rms
         raise RuntimeError(

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+import jaxsubdiv as js
+
 from ..model.pairing import Scene
 from ..model.priors.landmarks import Anchors
 from ..model.priors.shifts import SlicePlanes
-from ..scan.regions import Choice
 from ..scan.scan import Scan
 
 
@@ -70,24 +71,24 @@ def fill_scene(scene: Scene, size: int, has_slices: bool) -> Scene:
         strokes = strokes._replace(nearest=fill(strokes.nearest), most=jnp.asarray(strokes.most, scan.points.dtype))
     choice = scene.choice
     if choice is not None:
-        choice = Choice(fill(choice.of_points), jnp.asarray(choice.faces))
+        choice = js.FaceChoice(fill(choice.of_points), jnp.asarray(choice.faces))
     return Scene(whole, around, strokes, of_points, jnp.asarray(scene.open_vertices), choice)
 
 
-def fill_choices(choices: list[Choice | None], n_points: list[int]) -> list[Choice | None]:
+def fill_choices(choices: list[js.FaceChoice | None], n_points: list[int]) -> list[js.FaceChoice | None]:
     """The faces that points may be paired with, in as many sets as the subject with the most has; None where all have
     none."""
     given = [choice for choice in choices if choice is not None]
     if not given:
         return choices
     most, n_faces = max(len(choice.faces) for choice in given), given[0].faces.shape[1]
-    filled: list[Choice | None] = []
+    filled: list[js.FaceChoice | None] = []
     for choice, n in zip(choices, n_points, strict=True):
         of_points = np.full(n, -1, np.int32) if choice is None else np.asarray(choice.of_points)
         faces = np.ones((most, n_faces), bool)
         if choice is not None:
             faces[: len(choice.faces)] = choice.faces
-        filled.append(Choice(of_points, faces))
+        filled.append(js.FaceChoice(of_points, faces))
     return filled
 
 

@@ -241,7 +241,8 @@ def _unit_normals(sums: Float[Array, "m 4"], n: Float[Array, "v 3"], parents: In
         return unit(sum(others, first))[0]
 
     def of_nobody(n: Float[Array, "v 3"]) -> Float[Array, "m 3"]:
-        return jnp.zeros((sums.shape[0], 3), n.dtype)
+        # Zeros that under `shard_map` vary over devices as the other branch does.
+        return jnp.broadcast_to(0 * lax.stop_gradient(n[:1]), (sums.shape[0], 3))
 
     # The parents are looked up only where some sum vanishes: in most meshes none does.
     instead = lax.cond(jnp.all(there), of_nobody, jax.checkpoint(of_parents), n)
