@@ -2,7 +2,9 @@
 
 from importlib.metadata import version as _version
 
+from . import losses as losses
 from ._admissible import admissible_margin as admissible_margin
+from ._admissible import corner_cosines as corner_cosines
 from ._control import Control as Control
 from ._control import strong_float as strong_float
 from ._control_faces import child_edge_faces as child_edge_faces
@@ -10,6 +12,8 @@ from ._control_faces import control_edges as control_edges
 from ._control_faces import control_faces_of as control_faces_of
 from ._control_faces import splits_in_four as splits_in_four
 from ._creases import Creases as Creases
+from ._crossings import Crossings as Crossings
+from ._crossings import find_crossings as find_crossings
 from ._curvature import Curvatures as Curvatures
 from ._curvature import curvatures as curvatures
 from ._draw import draw_surface as draw_surface
@@ -24,7 +28,10 @@ from ._io import read_labelled_points as read_labelled_points
 from ._io import read_mesh as read_mesh
 from ._io import read_points as read_points
 from ._io import write_mesh as write_mesh
+from ._layer import SurfaceLayer as SurfaceLayer
 from ._memory import keep_freed_memory as keep_freed_memory
+from ._memory_of import Memory as Memory
+from ._memory_of import memory_of as memory_of
 from ._mesh import ControlMesh as ControlMesh
 from ._mesh import vector_areas as vector_areas
 from ._normals import estimate_normals as estimate_normals
@@ -50,6 +57,8 @@ from ._scheme import Loop as Loop
 from ._scheme import ModifiedButterfly as ModifiedButterfly
 from ._seams import SplitMesh as SplitMesh
 from ._seams import split_normals as split_normals
+from ._search_closest import search_closest as search_closest
+from ._search_nearest import search_nearest as search_nearest
 from ._stencils import interpolating_control as interpolating_control
 from ._stencils import stencils as stencils
 from ._surface import PointsAndNormals as PointsAndNormals
@@ -62,6 +71,7 @@ from ._surface import sum_corners as sum_corners
 from ._topology import Real as Real
 from ._topology import Topology as Topology
 from ._topology import build_topology as build_topology
+from .closest import FaceChoice as FaceChoice
 from .errors import MeshError as MeshError
 
 __version__ = _version("jaxsubdiv")

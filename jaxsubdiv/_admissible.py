@@ -1,12 +1,35 @@
-"""How far control normals are from folding the surface."""
+"""How far normals are from folding the surface."""
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, Int
 
 from ._control import Control
 from ._mesh import ControlMesh
 from .errors import name_rows
+from .linalg import cross, dot, take, unit
 from .notices import warn
+
+
+def corner_cosines(
+    vertices: Float[Array, "v 3"], normals: Float[Array, "v 3"], faces: dict[int, Int[Array, "..."]]
+) -> Float[Array, "c"]:
+    """The cosine between the vertex normal and the corner normal, eq. (5), at every corner of every face.
+
+    Under 0 the normal points to the back of the face. 0, with gradient 0, where either normal vanishes. The least at
+    a vertex is its `admissible_margin`.
+
+    Args:
+        vertices: positions, in any unit.
+        normals: one a vertex, of any length.
+        faces: `{3: [T, 3], 4: [Q, 4]}`; the corners of the triangles come first, the first corners before the second.
+    """
+    rows, normals = [], unit(normals)
+    for _, of_size in sorted(faces.items()):
+        corners = take(vertices, of_size)  # at once: every gather is a loop to compile in the derivative
+        after, before = (jnp.roll(corners, step, axis=1) - corners for step in (-1, 1))
+        rows.append(dot(take(normals, of_size), unit(cross(after, before)))[..., 0].T.reshape(-1))
+    return jnp.concatenate(rows)
 
 
 def admissible_margin(mesh: ControlMesh, control: Control | None = None) -> Float[np.ndarray, "v"]:

@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Float, Int
 
+from .closest import triangle_distance
+
 
 def closest_on_mesh(
     points: Float[np.ndarray, "p 3"], corners: Float[np.ndarray, "t 3 3"], first: int = 16
@@ -24,7 +26,8 @@ def closest_on_mesh(
     while len(left):
         found_at = tree.query(points[left], k=k)
         to_middle, candidates = (np.reshape(rows, (len(left), k)) for rows in found_at)  # one axis less for k = 1
-        found = _to_triangles(points[left][:, None], corners[candidates])
+        a, b, c = np.moveaxis(corners[candidates], (2, 3), (0, 1))
+        found = np.sqrt(triangle_distance(a, b - a, c - a, points[left].T[..., None])[0])
         best = found.argmin(axis=1)
         rows = np.arange(len(left))
         distance[left], nearest[left] = found[rows, best], candidates[rows, best]
@@ -32,20 +35,3 @@ def closest_on_mesh(
         settled = (distance[left] <= to_middle[:, -1] - reach) | (k == len(corners))
         left, k = left[~settled], min(4 * k, len(corners))
     return distance, nearest
-
-
-def _to_triangles(p: Float[np.ndarray, "p 1 3"], corners: Float[np.ndarray, "p k 3 3"]) -> Float[np.ndarray, "p k"]:
-    """Distance from points to triangles: to the plane where the foot lies inside, else to the nearest side."""
-    a, b, c = np.moveaxis(corners, 2, 0)
-    normal = np.cross(b - a, c - a)
-    square = np.einsum("...x,...x", normal, normal)
-    safe = np.where(square > 0, square, 1)
-    least, inside = np.inf, square > 0
-    for start, end in ((a, b), (b, c), (c, a)):
-        side, to = end - start, p - start
-        length = np.einsum("...x,...x", side, side)
-        at = np.clip(np.einsum("...x,...x", to, side) / np.where(length > 0, length, 1), 0, 1)
-        least = np.minimum(least, np.linalg.norm(to - at[..., None] * side, axis=-1))
-        inside = inside & (np.einsum("...x,...x", np.cross(side, to), normal) >= 0)
-    above = np.abs(np.einsum("...x,...x", p - a, normal)) / np.sqrt(safe)
-    return np.where(inside, above, least)

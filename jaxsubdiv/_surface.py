@@ -45,6 +45,17 @@ class RefinedSurface(eqx.Module):
         return jnp.concatenate([areas[:n], areas[n::2] + areas[n + 1 :: 2]])
 
     @eqx.filter_jit
+    def vertex_areas(self) -> Float[Array, "v"]:
+        """Every vertex' share of the area, an equal part of each of its faces, in the squared unit of the vertices."""
+        areas, total, before = self.areas(), jnp.zeros_like(self.vertices[:, 0]), 0
+        for size in (3, 4):
+            faces = self.faces[size]
+            shares = jnp.repeat(areas[before : before + len(faces)] / size, size)
+            total = total.at[faces.reshape(-1)].add(shares)
+            before += len(faces)
+        return total
+
+    @eqx.filter_jit
     def bounding_box(self) -> Float[Array, "2 3"]:
         """Least and greatest coordinates of the vertices that faces use."""
         used = take(self.vertices, self.triangles().reshape(-1))

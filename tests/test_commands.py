@@ -285,8 +285,10 @@ def test_fit_is_kept_where_its_surface_has_no_such_level(files, capsys, monkeypa
         raise ValueError("more memory than there is")
 
     monkeypatch.setattr("fitting.report.at_level.SurfaceAtLevel.__post_init__", none)
-    monkeypatch.setattr("fitting.__main__.draw_fit", lambda *_, **__: (_ for _ in ()).throw(ImportError("left out")))
-    monkeypatch.setattr("fitting.__main__.write_page", lambda path, *_, **__: path.touch())
+    monkeypatch.setattr(
+        "fitting.command.outputs.draw_fit", lambda *_, **__: (_ for _ in ()).throw(ImportError("left out"))
+    )
+    monkeypatch.setattr("fitting.command.outputs.write_page", lambda path, *_, **__: path.touch())
     assert run(fit, "scan.xyz", *GIVEN, "--max-sweeps", 1, "-o", "out", "--surface-level", 3) == 1
     assert "note     no surface: more memory than there is" in capsys.readouterr().out
     assert names(files / "out") == [name for name in RESULTS if name not in ("surface.ply", "fit.png")]
@@ -448,7 +450,7 @@ def stop_after(monkeypatch, sweeps: float) -> None:
         if sweep.number > sweeps:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("fitting.__main__._Progress._update", stop)
+    monkeypatch.setattr("fitting.command.progress.Progress.update", stop)
 
 
 def test_ctrl_c_leaves_a_checkpoint_and_the_same_command_goes_on(files, capsys, monkeypatch):
@@ -482,7 +484,7 @@ def test_resume_skips_what_is_done_and_goes_on_with_the_rest(files, capsys, monk
         if len(done) == 4:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("fitting.__main__._Progress._update", stop_in_second)
+    monkeypatch.setattr("fitting.command.progress.Progress.update", stop_in_second)
     assert first() == 130
     assert "with --resume it skips the scans that are done" in capsys.readouterr().err
     assert names(files / "out") == ["0", "1", "summary.csv"] and "checkpoint.npz" in names(files / "out" / "1")

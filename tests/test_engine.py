@@ -24,7 +24,6 @@ from fitting import (
     Sweeps,
     closest_points,
     find_symmetry,
-    search_closest,
     sparse_solver,
 )
 from fitting.model.pairing import make_scene
@@ -82,7 +81,7 @@ def noisy() -> fitting.FitResult:
 @pytest.fixture
 def search_of_the_device(monkeypatch):
     """One search for both linear solvers: of two triangles that are equally near, each search may take another."""
-    monkeypatch.setattr(sweeps, "closest_points", eqx.filter_jit(search_closest))
+    monkeypatch.setattr(sweeps, "closest_points", eqx.filter_jit(js.search_closest))
 
 
 def test_sweeps_are_a_solver_that_runs_as_one_program(search_of_the_device):

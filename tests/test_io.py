@@ -1004,7 +1004,7 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch, module, suffix):
 def test_import_loads_no_heavy_library():
     code = "import sys, {}; print(*(m for m in sys.argv[1:] if m in sys.modules))"
     extras = ["pyvista", "vtkmodules", "nibabel", "meshio", "matplotlib", "tqdm", "pyacvd", "rustworkx"]
-    for package, heavy in (("jaxsubdiv._io", ["trimesh", "scipy", *extras]), ("fitting, fitting.__main__", extras)):
+    for package, heavy in (("jaxsubdiv._io", ["trimesh", "scipy", *extras]), ("fitting, fitting.command.main", extras)):
         command = [sys.executable, "-c", code.format(package), *heavy]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
         assert done.stdout.split() == [], package

@@ -126,7 +126,7 @@ def test_elements_that_are_too_small_are_noticed():
     patches, rows = find_patches(surface, owner, model.topology.n_control_faces), row_faces(model, held.priors)
     for rings in (0, 1):
         elements = find_elements(model, rings)
-        found = differentiate(model, y, held.priors, elements.seeds, elements.seeds_of, rows, patches.vertices)
+        found = differentiate(model, y, held.priors, elements.seeds)
         assert forgets_some(elements, patches, found, rows) == (rings == 0)
 
 

@@ -14,7 +14,7 @@ from scans import noise, problem
 import fitting
 import jaxsubdiv as js
 from fitting.__main__ import main as fit_command
-from fitting.scan.regions import Choice, read_groups
+from fitting.scan.regions import read_groups
 
 GROUPS = ("inner", "outer")
 HEART = ("LV_ENDOCARDIAL", "LV_EPICARDIAL", "MITRAL_VALVE_CUT", "RV_FREEWALL", "RV_SEPTUM")
@@ -253,9 +253,9 @@ def test_search_is_that_of_the_chosen_faces_alone(kind):
     points = rng.uniform(vertices.min(axis=0) - 1, vertices.max(axis=0) + 1, (200, 3))
     chosen = rng.integers(3, size=surface.n_faces)[None] == np.arange(3)[:, None]
     rows = rng.integers(-1, 3, size=len(points)).astype(np.int32)
-    choice = Choice(rows, chosen)
+    choice = js.FaceChoice(rows, chosen)
     found = fitting.closest_points(surface, points, choice)
-    on_device = jax.jit(fitting.search_closest)(surface, jnp.asarray(points), choice)
+    on_device = jax.jit(js.search_closest)(surface, jnp.asarray(points), choice)
     own = [np.linalg.norm(np.asarray(js.evaluate(surface, at).points) - points, axis=1) for at in (found, on_device)]
     for row in (-1, 0, 1, 2):
         mask = np.ones(surface.n_faces, bool) if row < 0 else chosen[row]
@@ -276,9 +276,9 @@ def test_choices_of_no_face_or_of_another_surface_are_refused():
     surface = js.refine(js.Interpolating(), js.build_topology(mesh, js.Interpolating(), 1), mesh.control())
     points, none = np.zeros((2, 3)), np.zeros((1, surface.n_faces), bool)
     with pytest.raises(ValueError, match="no face that point 1 may lie on"):
-        fitting.closest_points(surface, points, Choice(np.array([-1, 0]), none))
+        fitting.closest_points(surface, points, js.FaceChoice(np.array([-1, 0]), none))
     with pytest.raises(ValueError, match="the choice is among 9 faces; the surface has"):
-        fitting.closest_points(surface, points, Choice(np.array([0, 0]), none[:, :9]))
+        fitting.closest_points(surface, points, js.FaceChoice(np.array([0, 0]), none[:, :9]))
 
 
 # Files

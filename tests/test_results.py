@@ -169,12 +169,12 @@ def test_fit_that_cannot_be_written_leaves_the_one_before_and_goes_on_from_its_l
     before = {name: Path("out", name).read_bytes() for name in RESULTS}
     command = ("scan.xyz", *QUICK[:-1], "3", "-o", "out")
     with monkeypatch.context() as patch:
-        patch.setattr("fitting.__main__.save_fit", lambda *_: 1 / 0)
+        patch.setattr("fitting.command.outputs.save_fit", lambda *_: 1 / 0)
         assert run(*command) == 2
     assert names("out") == sorted([*RESULTS, "checkpoint.npz", "checkpoint_start.npz"])
     assert before == {name: Path("out", name).read_bytes() for name in RESULTS}
     sweeps = []
-    monkeypatch.setattr("fitting.__main__._Progress._update", lambda self, sweep: sweeps.append(sweep.number))
+    monkeypatch.setattr("fitting.command.progress.Progress.update", lambda self, sweep: sweeps.append(sweep.number))
     assert run(*command, "--resume") == 1
     assert sweeps == [3] and names("out") == sorted(RESULTS)
     assert len(fitting.load("out").rms) == 4
@@ -216,7 +216,7 @@ def test_two_runs_do_not_work_in_one_folder(here, capsys):
 @pytest.mark.parametrize("scans", [["scan.xyz"], ["scan.xyz", "other.xyz"]])
 def test_folder_is_tried_before_the_work_starts(here, monkeypatch, capsys, scans):
     write_scan("other.xyz")
-    monkeypatch.setattr("fitting.__main__.read_scan", lambda *_, **__: pytest.fail("began to work"))
+    monkeypatch.setattr("fitting.command.inputs.read_scan", lambda *_, **__: pytest.fail("began to work"))
     assert run(*scans, *QUICK, "-o", "control.obj/out") == 2
     assert "control.obj" in capsys.readouterr().err
 
@@ -280,7 +280,7 @@ def test_scan_that_fails_in_whatever_way_does_not_end_a_batch(here, monkeypatch,
         return fitting.read_scan(path, **how)
 
     write_scan("bad.xyz")
-    monkeypatch.setattr("fitting.__main__.read_scan", read)
+    monkeypatch.setattr("fitting.command.inputs.read_scan", read)
     assert run("bad.xyz", "scan.xyz", *QUICK, "-o", "out") == 2
     assert names("out") == ["scan", "summary.csv"]
     assert [row["status"] for row in rows("out/summary.csv")] == ["2", "1"]

@@ -78,8 +78,8 @@ def test_report_and_uncertainty_of_a_loaded_fit_are_the_same(saved):
     found, expected = again.report(uncertainty=True).as_dict(), result.report(uncertainty=True).as_dict()
     assert found.keys() == expected.keys() and found["worst"] == expected["worst"]
     assert found["warnings"] == expected["warnings"] and found["pose"] == expected["pose"]
-    assert found["frame"] == expected["frame"]
-    for name in set(found) - {"worst", "reason", "h", "rms_per_sweep", "warnings", "pose", "frame"}:
+    assert found["frame"] == expected["frame"] and found["crossings_at"] == expected["crossings_at"]
+    for name in set(found) - {"worst", "reason", "h", "rms_per_sweep", "warnings", "pose", "frame", "crossings_at"}:
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-9, err_msg=name)
 
 
@@ -210,7 +210,7 @@ def test_fit_of_version_3_has_the_report_that_it_had(name, tmp_path):
 
 def old_report(found: fitting.FitResult) -> dict:
     """What reports had at that time."""
-    newer = ("trusted", "warnings", "pose", "frame", "regions")
+    newer = ("trusted", "warnings", "pose", "frame", "regions", "crossing_triangles", "crossings_at")
     return {name: value for name, value in found.report(uncertainty=True).as_dict().items() if name not in newer}
 
 

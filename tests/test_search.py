@@ -54,7 +54,7 @@ CASES = [*((shape, np.float64) for shape in MESHES), ("mixed", np.float32)]
 def test_places_are_those_of_the_host(shape, dtype):
     surface = surface_of(MESHES[shape], dtype)
     points = some_points(surface)
-    found, expected = fitting.search_closest(surface, jnp.asarray(points)), fitting.closest_points(surface, points)
+    found, expected = js.search_closest(surface, jnp.asarray(points)), fitting.closest_points(surface, points)
     assert found.face.dtype == np.int32 and found.uv.dtype == dtype
     own, host = (distances(surface, at, points) for at in (found, expected))
     size = np.linalg.norm(points, axis=1) + np.ptp(surface.vertices, axis=0).max()
@@ -71,9 +71,9 @@ def test_places_are_those_of_the_host(shape, dtype):
 def test_patches_and_blocks_of_any_size_find_the_same():
     surface = surface_of(MESHES["mixed"], np.float64)
     points = jnp.asarray(some_points(surface)[::7])
-    expected = distances(surface, fitting.search_closest(surface, points), points)
+    expected = distances(surface, js.search_closest(surface, points), points)
     for options in ({"patch": 7}, {"patch": 10_000}, {"memory": 1 << 16}):
-        found = fitting.search_closest(surface, points, **options)
+        found = js.search_closest(surface, points, **options)
         np.testing.assert_allclose(distances(surface, found, points), expected, rtol=1e-12, atol=1e-12)
 
 
@@ -84,7 +84,7 @@ def test_many_surfaces_at_once_are_searched_as_one_by_one():
     scans = jnp.stack([points, points + 1.0, points * 0.5])
 
     def search(vertices, points):
-        return fitting.search_closest(js.RefinedSurface(vertices, surface.normals, surface.faces), points)
+        return js.search_closest(js.RefinedSurface(vertices, surface.normals, surface.faces), points)
 
     together = jax.jit(jax.vmap(search))(vertices, scans)
     for i in range(len(scans)):
@@ -98,7 +98,7 @@ def test_points_that_are_not_finite_do_not_keep_the_others_waiting():
     points = some_points(surface, 20)
     broken = points.copy()
     broken[3], broken[10] = np.nan, np.inf
-    found, expected = (fitting.search_closest(surface, jnp.asarray(rows)) for rows in (broken, points))
+    found, expected = (js.search_closest(surface, jnp.asarray(rows)) for rows in (broken, points))
     others = np.setdiff1d(np.arange(len(points)), (3, 10))
     np.testing.assert_array_equal(found.face[others], expected.face[others])
     assert np.all((np.asarray(found.face) >= 0) & (np.asarray(found.face) < surface.n_faces))
@@ -111,5 +111,5 @@ def test_faces_without_area_do_not_hide_the_others():
         *(jnp.asarray(rows) for rows in (vertices, vertices)), jax.tree.map(jnp.asarray, by_size)
     )
     points = some_points(surface, 50)
-    found, expected = fitting.search_closest(surface, jnp.asarray(points)), fitting.closest_points(surface, points)
+    found, expected = js.search_closest(surface, jnp.asarray(points)), fitting.closest_points(surface, points)
     np.testing.assert_allclose(*(distances(surface, at, points) for at in (found, expected)), rtol=1e-9, atol=1e-12)

@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # its parts are loaded where they are used
 from jaxtyping import Float, Int, Shaped
-from scipy.ndimage import gaussian_filter, map_coordinates
 
 from jaxsubdiv.notices import warn
 
@@ -211,11 +211,10 @@ def _slope(
     values: Float[np.ndarray, "i j k"], index: Float[np.ndarray, "p 3"], widths: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "p 3"]:
     """How the smoothed values grow from index to index; past the image's end they go on as they are there."""
-    smooth = gaussian_filter(values, widths, mode="nearest", truncate=_REACH)
+    smooth = scipy.ndimage.gaussian_filter(values, widths, mode="nearest", truncate=_REACH)
     steps = np.eye(3)
-    ends = [
-        map_coordinates(smooth, (index + sign * step).T, order=1, mode="nearest") for step in steps for sign in (1, -1)
-    ]
+    places = [(index + sign * step).T for step in steps for sign in (1, -1)]
+    ends = [scipy.ndimage.map_coordinates(smooth, place, order=1, mode="nearest") for place in places]
     return np.stack([(ahead - behind) / 2 for ahead, behind in zip(ends[::2], ends[1::2], strict=True)], axis=1)
 
 
@@ -251,7 +250,7 @@ def _tell_thin(
     step = volume.voxel_volume ** (1 / 3)
     per_mm = np.linalg.inv(volume.affine[:3, :3]).T
     within = found.at - (_THIN * step * outward) @ per_mm
-    inside = map_coordinates(mask.astype(np.uint8), np.round(within).T, order=0, mode="nearest")
+    inside = scipy.ndimage.map_coordinates(mask.astype(np.uint8), np.round(within).T, order=0, mode="nearest")
     thin = (inside == 0) & (outward != 0).any(axis=1)
     if thin.mean() > _MANY_THIN:
         warn(

@@ -14,7 +14,6 @@ from jaxsubdiv.linalg import dot, norm, unit
 
 from ..scan.closest_points import boundary_vertices, nearest_rows
 from ..scan.outliers import NEIGHBOURS, is_dense, rows_for_density, scattered_points
-from ..scan.regions import Choice
 from ..scan.scan import Scan
 from ..scan.slices import Strokes, find_strokes
 from .priors.shifts import SlicePlanes
@@ -96,12 +95,12 @@ class Scene(NamedTuple):
     """The row of the slice of each point that may be shifted, -1 where it stays; None where none may."""
     open_vertices: Bool[Array | np.ndarray, "v"]
     """Which vertices of the surface lie on a boundary."""
-    choice: Choice | None = None
+    choice: js.FaceChoice | None = None
     """The faces of the surface that each point may be paired with; None where all may be with any."""
 
 
 def make_scene(
-    scan: Scan, surface: js.RefinedSurface, planes: SlicePlanes | None = None, choice: Choice | None = None
+    scan: Scan, surface: js.RefinedSurface, planes: SlicePlanes | None = None, choice: js.FaceChoice | None = None
 ) -> Scene:
     """The scene of a scan.
 

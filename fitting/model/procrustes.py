@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ..scan.closest_points import AnyArray
+from jaxsubdiv.closest import AnyArray
 
 
 def align_shape(shape: AnyArray, vertices: AnyArray, xp: Any = np, *, scale: bool = True) -> AnyArray:

@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 import jaxsubdiv as js
+from jaxsubdiv.closest import AnyArray
 from jaxsubdiv.linalg import Rows, cross, unit
-
-from ..scan.closest_points import AnyArray
 
 
 class Free(eqx.Module):

@@ -29,17 +29,6 @@ class Place(NamedTuple):
     """Scan points within half a control edge."""
 
 
-def vertex_areas(surface: js.RefinedSurface) -> Float[np.ndarray, "v"]:
-    """Every vertex' share of the surface's area: an equal part of each of its faces, in mm^2."""
-    areas, total, before = np.asarray(surface.areas(), np.float64), np.zeros(len(surface.vertices)), 0
-    for size in (3, 4):
-        faces = np.asarray(surface.faces[size])
-        shares = np.repeat(areas[before : before + len(faces)] / size, size)
-        total += np.bincount(faces.ravel(), shares, len(total))
-        before += len(faces)
-    return total
-
-
 def distances_to_scan(surface: js.RefinedSurface, seen: Look, inliers: Bool[np.ndarray, "p"]) -> Float[np.ndarray, "v"]:
     """Signed distance in mm from every vertex of the surface to the scan, positive where the scan lies outside.
 

@@ -18,7 +18,7 @@ from jaxsubdiv.linalg import unit
 
 from ..model.pairing import on_boundary
 from ..scan.closest_points import boundary_vertices
-from ..solve.elements import differentiate_across, face_corners
+from ..solve.elements import differentiate_across, face_corners, slopes_of_rows
 from ..solve.strengths import neighbourhood_mean
 from .misfit import misfit_variances
 from .record import Fit
@@ -67,20 +67,17 @@ class Posterior:
         face = np.zeros(len(surface.vertices), np.int64)
         face[corners] = owner[:, None]
         across = np.asarray(differentiate_across(model, fit.y, elements.seeds, surface.normals))
-        variances = self._variances(face, lambda rows: across[elements.seeds_of[face[rows]], rows[:, None]])
+        variances = self._variances(face, lambda rows: slopes_of_rows(elements, across[rows], face[rows]))
         return np.sqrt(variances + _at_vertices(self._misfit_of_faces, corners, owner, len(variances)))
 
     @functools.cached_property
     def _surface_variances(self) -> Float[np.ndarray, "w"]:
         """Of every vertex of the surface along its normal."""
-        structure, found = self.equations.structure, self.equations.found
-        normals, patches = np.asarray(self.fit.surface().normals, np.float64), structure.patches
-        face, slot = np.zeros((2, len(normals)), np.int64)
-        face[structure.corners], slot[structure.corners] = patches.owner[:, None], patches.slots
-        by_surface = np.asarray(found.by_surface)
-        return self._variances(
-            face, lambda rows: np.einsum("vdx,vx->vd", by_surface[face[rows], slot[rows]], normals[rows])
-        )
+        structure, normals = self.equations.structure, np.asarray(self.fit.surface().normals)
+        across = np.einsum("vxs,vx->vs", np.asarray(self.equations.found.of_surface), normals)
+        face = np.zeros(len(normals), np.int64)
+        face[structure.corners] = structure.patches.owner[:, None]
+        return self._variances(face, lambda rows: slopes_of_rows(structure.elements, across[rows], face[rows]))
 
     def _variances(
         self, face: Int[np.ndarray, "w"], derivatives: Callable[[Int[np.ndarray, "r"]], Float[np.ndarray, "r d"]]
@@ -105,13 +102,13 @@ class Posterior:
 
     def covariances(self, at: js.SurfacePoint) -> Float[np.ndarray, "p 3 3"]:
         """Of places that move along with the surface, in mm^2, without the misfit."""
-        structure, by_surface = self.equations.structure, np.asarray(self.equations.found.by_surface)
-        face = np.asarray(at.face)
-        owner, slots = structure.patches.owner[face], structure.patches.slots[face]
-        _, weights = js.corner_weights(self.fit.surface(), at)
-        by = np.einsum("pc,pcdx->pdx", np.asarray(weights, np.float64), by_surface[owner[:, None], slots])
+        structure = self.equations.structure
+        owner = structure.patches.owner[np.asarray(at.face)]
+        corners, weights = (np.asarray(part) for part in js.corner_weights(self.fit.surface(), at))
+        along = np.einsum("pc,pcxs->pxs", weights, np.asarray(self.equations.found.of_surface)[corners])
+        by = np.take_along_axis(along, structure.elements.seeds_of[owner][:, None], axis=2).astype(np.float64)
         blocks = self.factor.covariance_blocks(self._free_columns(structure.elements.columns[owner]))
-        return np.einsum("pdx,pde,pey->pxy", by, blocks, by, optimize=True)
+        return np.einsum("pxd,pde,pye->pxy", by, blocks, by, optimize=True)
 
     def _control_variances(self) -> Float[np.ndarray, "v"]:
         """Of every control vertex along its normal."""

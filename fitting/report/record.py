@@ -15,9 +15,9 @@ from ..model.pairing import Look, Scene
 from ..model.recipe import Settings
 from ..model.residual import Held, Model
 from ..model.unknowns import Variables
-from ..scan.regions import Choice, RegionMatch
+from ..scan.regions import RegionMatch
 from ..scan.scan import Scan
-from ..solve.sparse_normal import SparseEquations, find_structure
+from ..solve.sparse_normal import SparseEquations, Structure, find_structure
 from ..solve.strengths import Strengths
 from ..solve.sweeps import HOLD, active_unknowns, hold_priors, hold_sweep, loose_damping, measure_look
 
@@ -41,6 +41,7 @@ class Fit:
         rms, robust_rms: of the distances in mm, at the start and after every sweep.
         result: why it ended.
         origin: how it came to its start.
+        structure: what the analysis found, where the fit was solved on the host; a saved fit is analysed again.
     """
 
     model: Model
@@ -58,6 +59,7 @@ class Fit:
     robust_rms: Float[np.ndarray, "sweeps"]
     result: optx.RESULTS
     origin: Origin = dataclasses.field(default_factory=Origin)
+    structure: Structure | None = None
 
     @property
     def topology(self) -> js.Topology:
@@ -121,11 +123,11 @@ class Fit:
     def equations(self) -> SparseEquations:
         """The normal equations about the surface found."""
         held = self.held()
-        structure = find_structure(self.model, self.y, held.priors)
+        structure = self.structure or find_structure(self.model, self.y, held.priors)
         return SparseEquations(structure, self.model, self.y, held)
 
 
-def choose_faces(regions: RegionMatch | None, model: Model, y: Variables, scan: Scan) -> Choice | None:
+def choose_faces(regions: RegionMatch | None, model: Model, y: Variables, scan: Scan) -> js.FaceChoice | None:
     """The faces of the surface that each point of a scan may be paired with; None where all may be with any."""
     if regions is None or not regions.groups:
         return None

@@ -84,6 +84,9 @@ class Report:
         determined: about how many of these the scan determines, the rest being left to the priors.
         least_margin: the least `admissible_margin` of the control normals: the surface is smooth above 0.05, and folds
             below -0.2. None where the scheme does not look at normals.
+        crossing_triangles: how many triangles of the surface go through others of it, a quad being two; None where
+            that was not asked for, or the extra `contact` is not installed.
+        crossings_at: x, y, z in mm, the middle of the crossings; None where there are none.
         uncertainty_median, uncertainty_95: median and 95th percentile, over the covered area, of the surface's standard
             deviation; None where it was not asked for.
         shifts: of the slices of the scan, which the distances have been measured after; empty where none was free.
@@ -122,6 +125,8 @@ class Report:
     n_unknowns: int
     determined: float
     least_margin: float | None
+    crossing_triangles: int | None
+    crossings_at: list[float] | None
     uncertainty_median: float | None
     uncertainty_95: float | None
     shifts: list[SliceShift]
@@ -177,6 +182,11 @@ class Report:
             rows.append(("likeness to the template", f"{self.likeness:.2f}"))
         if self.least_margin is not None:
             rows.append(("least margin of a normal", f"{self.least_margin:+.2f}"))
+        if self.crossing_triangles is not None:
+            where = ""
+            if self.crossings_at is not None:
+                where = f", around ({', '.join(f'{x:.1f}' for x in self.crossings_at)})"
+            rows.append(("triangles that cross others", f"{self.crossing_triangles:,}{where}"))
         if self.shifts:
             far = [math.hypot(*one.shift) for one in self.shifts]
             root = math.sqrt(sum(length**2 for length in far) / len(far))

@@ -18,7 +18,7 @@ from ..model.pairing import make_scene
 from ..model.recipe import Settings
 from ..scan.scan import Scan
 from .at_level import SurfaceAtLevel
-from .coverage import distances_to_scan, vertex_areas, weighted_quantile, worst_places
+from .coverage import distances_to_scan, weighted_quantile, worst_places
 from .evidence import gather_evidence
 from .findings import find_what_speaks_against
 from .posterior import Posterior, Uncertainty
@@ -114,7 +114,16 @@ class FitResult:
     @functools.cached_property
     def _seen_from_the_scan(self) -> tuple[Float[np.ndarray, "v"], Float[np.ndarray, "v"]]:
         """Of every vertex of the surface its area, and its distance to the scan; see `distances_to_scan`."""
-        return vertex_areas(self.surface), distances_to_scan(self.surface, self.fit.look, self.inliers)
+        areas = np.asarray(self.surface.vertex_areas(), np.float64)
+        return areas, distances_to_scan(self.surface, self.fit.look, self.inliers)
+
+    @functools.cached_property
+    def crossings(self) -> js.Crossings | None:
+        """Where the surface goes through itself; None where the extra `contact` is not installed."""
+        try:
+            return js.find_crossings(self.surface)
+        except ImportError:
+            return None
 
     @functools.cached_property
     def control_mesh(self) -> js.ControlMesh:
@@ -181,7 +190,8 @@ class FitResult:
         """The fit in numbers: `print` it, or take `.as_dict()`.
 
         Args:
-            uncertainty: with that of the surface, which takes a second or more.
+            uncertainty: with that of the surface, and with the triangles that cross others, which takes a second or
+                more.
         """
         areas, to_scan = self._seen_from_the_scan
         covered = ~np.isnan(to_scan)
@@ -189,6 +199,7 @@ class FitResult:
         known, share = bool(areas_there.sum() > 0), areas_there / max(areas_there.sum(), np.finfo(float).tiny)
         spread = self.uncertainty().surface[covered] if uncertainty and known else None
         edge = float(js.edge_length(self.fit.topology, self.control.vertices))
+        crossings = self.crossings if uncertainty else None
         return Report(
             trusted=self.trusted,
             warnings=self.warnings,
@@ -221,6 +232,8 @@ class FitResult:
             n_unknowns=_count_unknowns(self.fit),
             determined=float(self.fit.strengths.determined),
             least_margin=float(js.admissible_margin(self.control_mesh).min()) if self.scheme.uses_normals else None,
+            crossing_triangles=None if crossings is None else len(crossings.triangles),
+            crossings_at=np.median(crossings.places, axis=0).tolist() if crossings and len(crossings.places) else None,
             uncertainty_median=None if spread is None else weighted_quantile(spread, share, 0.5),
             uncertainty_95=None if spread is None else weighted_quantile(spread, share, 0.95),
             shifts=[SliceShift(int(i), shift.tolist()) for i, shift in zip(self.slices, self.shifts, strict=True)],
@@ -263,4 +276,6 @@ def _words(result: optx.RESULTS) -> str:
     """Why the fit stopped, in words; optimistix's own where they are not about its inner steps."""
     if result == optx.RESULTS.nonlinear_max_steps_reached:
         return "max_sweeps reached before the distances came to rest"
+    if result == optx.RESULTS.nonlinear_divergence:
+        return "at rest where it started, far from the scan"
     return str(optx.RESULTS[result])

@@ -1,5 +1,6 @@
 """`fit`: steps the solver `Sweeps` until the surface has come to rest, with progress and checkpoints."""
 
+import dataclasses
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -144,11 +145,7 @@ def fit(
     if alike is not None and alike.shape != (topology.n_control_faces,):
         n_faces = topology.n_control_faces
         raise ValueError(f"`alike` must say it of each of the {n_faces} control faces; got {list(alike.shape)}.")
-    if regions is not None and len(regions.faces) != topology.n_control_faces:
-        raise ValueError(
-            f"`regions` are of {len(regions.faces)} control faces, and the topology has {topology.n_control_faces}. "
-            "Match the scan with the control mesh that the topology was made from."
-        )
+    check_regions(regions, topology)
     control = sound_start(scheme, topology, control, free)
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
     settings["landmark_deviation"] = landmark_deviation
@@ -180,9 +177,11 @@ def fit(
             kept.write_tree((y, state))
     if kept is not None and not keep_checkpoint:
         kept.remove()
-    found = FitResult(
-        record_fit(model, y, state, scene, scan, control, inputs, Settings.of(scheme, topology, **settings), result)
-    )
+    told = Settings.of(scheme, topology, **settings)
+    record = record_fit(model, y, state, scene, scan, control, inputs, told, result)
+    if isinstance(solver.linear_solver, SparseNormal):
+        record = dataclasses.replace(record, structure=solver.linear_solver.structure)
+    found = FitResult(record)
     if throw and result != optx.RESULTS.successful:
         rms = found.rms
         raise RuntimeError(
@@ -271,6 +270,15 @@ def record_fit(
         robust_rms=state.robust_rms[:n],
         result=result,
     )
+
+
+def check_regions(regions: RegionMatch | None, topology: js.Topology) -> None:
+    """Refuses regions of another control mesh."""
+    if regions is not None and len(regions.faces) != topology.n_control_faces:
+        raise ValueError(
+            f"`regions` are of {len(regions.faces)} control faces, and the topology has {topology.n_control_faces}. "
+            "Match the scan with the control mesh that the topology was made from."
+        )
 
 
 def find_partners(

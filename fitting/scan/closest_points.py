@@ -1,15 +1,14 @@
 """Correspondence: for every scan point the closest point of the surface. On the host, outside of differentiation."""
 
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
-from jaxsubdiv import RefinedSurface, SurfacePoint
+from jaxsubdiv import FaceChoice, RefinedSurface, SurfacePoint
+from jaxsubdiv.closest import dot_products, polish, to_faces, triangle_choice, triangle_distance
 from jaxsubdiv.half_edges import half_edges
-
-from .regions import Choice
 
 _GROUP = 4  # triangles that stand in the tree as one: refining replaces a face by four, whose rows follow each other
 _LARGE, _MOST_PARTS = 1.5, 24  # times the usual size: larger triangles stand in the tree in parts, to so many a side
@@ -21,9 +20,6 @@ _TINY = np.finfo(float).tiny
 _SLACK = 1e-9  # relative: by so much bounds are wider than rounding could make them wrong
 _ROUNDING = 1e-10  # of squared distances whose parts along and across a normal are subtracted
 _THIN = 1e-8  # squared sine of the angle at a corner: the normals of thinner triangles are not exact to `_ROUNDING`
-_QUAD_STEPS = 3
-
-AnyArray: TypeAlias = Any  # of numpy or of JAX: what is below `triangle_distance` serves `_search` too
 
 
 class _Triangles(NamedTuple):
@@ -45,7 +41,7 @@ class _Groups(NamedTuple):
 
 
 def closest_points(
-    surface: RefinedSurface, points: Float[Array | np.ndarray, "p 3"], choice: Choice | None = None
+    surface: RefinedSurface, points: Float[Array | np.ndarray, "p 3"], choice: FaceChoice | None = None
 ) -> SurfacePoint:
     """Closest surface point of every point: the face and where in it, not the nearest vertex.
 
@@ -74,22 +70,6 @@ def closest_points(
         quad = np.asarray(surface.faces[4])[face[in_quad] - len(surface.faces[3])]
         uv[in_quad] = polish(vertices[quad], points[in_quad], uv[in_quad])
     return SurfacePoint(face.astype(np.int32), uv.astype(surface.vertices.dtype))
-
-
-def triangle_choice(
-    choice: Choice, surface: RefinedSurface, xp: Any = np
-) -> tuple[Int[AnyArray, "p"], Bool[AnyArray, "k t"]]:
-    """The row of each point, and in it the triangles of the triangulated view that it may lie on: in the last, all.
-
-    Raises:
-        ValueError: the choice is of another number of faces.
-    """
-    if choice.faces.shape[1] != surface.n_faces:
-        raise ValueError(f"the choice is among {choice.faces.shape[1]} faces; the surface has {surface.n_faces}.")
-    n = surface.faces[3].shape[0]
-    chosen = xp.concatenate([choice.faces, xp.ones_like(choice.faces[:1])])
-    rows = xp.where(choice.of_points < 0, len(choice.faces), choice.of_points)
-    return rows, xp.concatenate([chosen[:, :n], xp.repeat(chosen[:, n:], 2, axis=1)], axis=1)
 
 
 def boundary_vertices(surface: RefinedSurface) -> Bool[np.ndarray, "v"]:
@@ -210,7 +190,7 @@ class _Search:
         """Distances of points from a triangle of a group each, a little more."""
         balls = np.take(self._groups.balls, groups, axis=1).reshape(_GROUP, 4, -1)
         away = balls[:, :3] - np.take(self._points, rows, axis=1)
-        member = _dot(away, away).argmin(axis=0)
+        member = dot_products(away, away).argmin(axis=0)
         distances = self._measure(rows, self._groups.triangles[member, groups])[0]
         return distances * (1 + _SLACK) + 100 * self._rounding[rows]
 
@@ -225,13 +205,13 @@ class _Search:
             balls = np.take(self._groups.balls, group, axis=1).reshape(_GROUP, 4, -1)
             for (*middle, radius), triangle in zip(balls, self._groups.triangles, strict=True):
                 away = np.stack(middle) - points
-                squared = _dot(away, away, 0)
+                squared = dot_products(away, away, 0)
                 hit = np.flatnonzero(squared <= (radius + bound) ** 2)
                 which = triangle[group[hit]]
                 # A triangle lies in the disc that its plane cuts out of the ball.
                 squared = squared[hit]
                 rounding = _ROUNDING * squared
-                above = _dot(np.take(self._normals, which, axis=1), away[:, hit], 0) ** 2
+                above = dot_products(np.take(self._normals, which, axis=1), away[:, hit], 0) ** 2
                 beside = np.sqrt(np.maximum(squared - above - rounding, 0)) - radius[hit]
                 to_disc = np.maximum(above - rounding, 0) + np.maximum(beside, 0) ** 2
                 near = to_disc <= bound[hit] ** 2
@@ -280,8 +260,8 @@ def _normals(triangles: _Triangles) -> Float[np.ndarray, "3 t"]:
     """Unit normals; zero, which makes a ball of the disc, where a triangle is so thin that its normal is not exact."""
     (x, y, z), (p, q, r) = triangles.ab, triangles.ac
     normals = np.stack([y * r - z * q, z * p - x * r, x * q - y * p])
-    squared = _dot(normals, normals, 0)
-    sound = squared > _THIN * _dot(triangles.ab, triangles.ab, 0) * _dot(triangles.ac, triangles.ac, 0)
+    squared = dot_products(normals, normals, 0)
+    sound = squared > _THIN * dot_products(triangles.ab, triangles.ab, 0) * dot_products(triangles.ac, triangles.ac, 0)
     return normals * np.where(sound, 1 / np.sqrt(np.where(sound, squared, 1)), 0)
 
 
@@ -295,7 +275,7 @@ def _groups(triangles: _Triangles) -> _Groups:
     centres, squared = (low + high) / 2, np.zeros(members.shape[1])
     to_a = a - centres[:, None]
     for corner in (to_a, to_a + ab, to_a + ac):
-        squared = np.maximum(squared, _dot(corner, corner, 0).max(axis=0))
+        squared = np.maximum(squared, dot_products(corner, corner, 0).max(axis=0))
     reach = np.sqrt(squared) * (1 + _SLACK)
     balls = np.concatenate([middles, radii[None]]).swapaxes(0, 1)  # a member's four numbers one after another
     balls[1:, :3][:, :, -1][members[1:, -1] == members[:-1, -1]] = np.inf  # the last row, repeated
@@ -316,9 +296,9 @@ def _balls(triangles: _Triangles) -> tuple[Float[np.ndarray, "3 t s"], Float[np.
     """Middles of the triangles, and how far the corners are from them."""
     a, ab, ac = triangles
     middle = (ab + ac) / 3
-    squared = _dot(middle, middle, 0)
+    squared = dot_products(middle, middle, 0)
     for side in (ab, ac):
-        squared = np.maximum(squared, _dot(middle - side, middle - side, 0))
+        squared = np.maximum(squared, dot_products(middle - side, middle - side, 0))
     return a + middle, np.sqrt(squared) * (1 + _SLACK)
 
 
@@ -339,78 +319,3 @@ def _parts(
         owner.append(np.repeat(which[cut], len(u)))
         sizes.append(np.repeat(radii[cut] / n, len(u)))
     return np.concatenate(owner), np.concatenate(points, axis=1), np.concatenate(sizes)
-
-
-def triangle_distance(
-    a: AnyArray, ab: AnyArray, ac: AnyArray, points: AnyArray, xp: Any = np
-) -> tuple[AnyArray, AnyArray, AnyArray]:
-    """Squared distance to a triangle each, and u and v of the closest point, a + u (b - a) + v (c - a).
-
-    Args:
-        a, ab, ac: a corner, and the edges from it to the next corner and to the one before; `[3, ...]`, coordinate by
-            coordinate, as rows of three are slow.
-        points: a point each, likewise.
-        xp: numpy or jax.numpy.
-    """
-    ap = points - a
-
-    def dot(x: AnyArray, y: AnyArray) -> AnyArray:
-        return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
-
-    d00, d01, d11, d20, d21 = dot(ab, ab), dot(ab, ac), dot(ac, ac), dot(ap, ab), dot(ap, ac)
-    area = d00 * d11 - d01 * d01
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = (d11 * d20 - d01 * d21) / area, (d00 * d21 - d01 * d20) / area
-        inside = (u >= 0) & (v >= 0) & (u + v <= 1)  # False where the area is zero
-        # Outside, the closest point lies on one of the edges ab, ac, bc; a triangle without area is its edges alone.
-        on_ab = xp.nan_to_num(xp.clip(d20 / d00, 0, 1))
-        on_ac = xp.nan_to_num(xp.clip(d21 / d11, 0, 1))
-        on_bc = xp.nan_to_num(xp.clip((d21 - d20 - d01 + d00) / (d00 - 2 * d01 + d11), 0, 1))
-
-    def squared(u: AnyArray, v: AnyArray) -> AnyArray:
-        away = u[None] * ab + v[None] * ac - ap  # not by the products above: their difference has no digits close by
-        return dot(away, away)
-
-    u, v = xp.where(inside, u, on_ab), xp.where(inside, v, 0.0)
-    best = squared(u, v)
-    for other_u, other_v in ((xp.zeros_like(on_ac), on_ac), (1 - on_bc, on_bc)):
-        other = xp.where(inside, np.inf, squared(other_u, other_v))
-        closer = other < best
-        u, v, best = xp.where(closer, other_u, u), xp.where(closer, other_v, v), xp.where(closer, other, best)
-    return best, u, v
-
-
-def to_faces(n_triangle_faces: int, triangle: AnyArray, uv: AnyArray, xp: Any = np) -> tuple[AnyArray, AnyArray]:
-    """From the triangulated view, where a quad is (a, b, c) and (a, c, d), to faces `[p]` and their own `uv [p, 2]`."""
-    half = triangle - n_triangle_faces
-    in_quad, second = half >= 0, half % 2 == 1
-    u, v = uv.T
-    quad_uv = xp.stack([xp.where(second, u, u + v), xp.where(second, u + v, v)], axis=1)
-    return xp.where(in_quad, n_triangle_faces + half // 2, triangle), xp.where(in_quad[:, None], quad_uv, uv)
-
-
-def polish(corners: AnyArray, points: AnyArray, uv: AnyArray, xp: Any = np) -> AnyArray:
-    """Gauss-Newton steps to the closest point of a bilinear patch `[p, 4, 3]` each, kept inside of it."""
-    a, b, c, d = xp.moveaxis(corners, 1, 0)
-    twist = a - b + c - d
-    for _ in range(_QUAD_STEPS):
-        u, v = uv[:, :1], uv[:, 1:]
-        along_u, along_v = (b - a) + v * twist, (d - a) + u * twist
-        residual = a + u * (b - a) + v * (d - a) + u * v * twist - points
-        g0, g1 = _dot(along_u, residual), _dot(along_v, residual)
-        h00, h01, h11 = _dot(along_u, along_u), _dot(along_u, along_v), _dot(along_v, along_v)
-        # Where a side holds the point fast, the other coordinate moves alone.
-        held_u = ((uv[:, 0] <= 0) & (g0 > 0)) | ((uv[:, 0] >= 1) & (g0 < 0))
-        held_v = ((uv[:, 1] <= 0) & (g1 > 0)) | ((uv[:, 1] >= 1) & (g1 < 0))
-        h01 = xp.where(held_u | held_v, 0.0, h01)
-        det = h00 * h11 - h01 * h01
-        safe = xp.where(det > 0, det, 1.0)
-        step_u = xp.where(held_u | (det <= 0), 0.0, (h11 * g0 - h01 * g1) / safe)
-        step_v = xp.where(held_v | (det <= 0), 0.0, (h00 * g1 - h01 * g0) / safe)
-        uv = xp.clip(uv - xp.stack([step_u, step_v], axis=1), 0, 1)
-    return uv
-
-
-def _dot(a: AnyArray, b: AnyArray, axis: int = 1) -> AnyArray:
-    a, b = ((x[0], x[1], x[2]) if axis == 0 else (x[:, 0], x[:, 1], x[:, 2]) for x in (a, b))
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

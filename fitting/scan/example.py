@@ -19,5 +19,6 @@ def example(name: Example) -> tuple[Scan, js.ControlMesh]:
     """
     if name not in get_args(Example):
         raise ValueError(f"`name` must be one of {', '.join(map(repr, get_args(Example)))}; got {name!r}.")
-    with as_file(files("fitting") / "data" / f"{name}.npz") as path:
+    package = __name__.rsplit(".", 2)[0]  # by its name on import, which may be `jaxsubdiv.fitting`
+    with as_file(files(package) / "data" / f"{name}.npz") as path:
         return read_scan(path), js.read_mesh(path)

@@ -5,11 +5,11 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Int
 
 import jaxsubdiv as js
 
@@ -17,14 +17,6 @@ from .scan import Scan, ScanError
 
 Groups: TypeAlias = Mapping[str, str | Sequence[str] | None]
 """Label of a scan -> the template's group, or groups, that its points lie on; None where it may be any."""
-
-
-class Choice(NamedTuple):
-    """The faces of a surface that each point may be paired with."""
-
-    of_points: Int[Array | np.ndarray, "p"]
-    """The row of `faces` of each point; -1 where it may be any face."""
-    faces: Bool[Array | np.ndarray, "k f"]
 
 
 class RegionMatch(eqx.Module):
@@ -62,7 +54,7 @@ class RegionMatch(eqx.Module):
         rows = [kinds.index(known[label]) if label in known else -1 for label in scan.regions.names]
         return np.array([*rows, -1])[scan.regions.rows]  # the last for points without a label, whose row is -1
 
-    def choice(self, scan: Scan, owner: Int[np.ndarray, "f"]) -> Choice | None:
+    def choice(self, scan: Scan, owner: Int[np.ndarray, "f"]) -> js.FaceChoice | None:
         """What the points of a scan may be paired with; None where all may be with any face.
 
         Args:
@@ -73,7 +65,7 @@ class RegionMatch(eqx.Module):
             return None
         region = self.faces.rows[owner]
         faces = [np.isin(region, [self.faces.names.index(name) for name in kind]) for kind in self.kinds]
-        return Choice(of_points.astype(np.int32), np.stack(faces))
+        return js.FaceChoice(of_points.astype(np.int32), np.stack(faces))
 
 
 def match_regions(scan: Scan, mesh: js.ControlMesh, groups: Groups | None = None) -> RegionMatch | None:

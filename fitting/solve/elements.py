@@ -6,6 +6,8 @@ have no face in common (Curtis, Powell and Reid, On the estimation of sparse Jac
 equations are sums of small dense matrices, one a face. Which vertices belong to which face is analysed once.
 """
 
+import heapq
+import itertools
 import math
 from typing import Any, NamedTuple
 
@@ -19,7 +21,7 @@ from jaxtyping import Array, Float, Int
 import jaxsubdiv as js
 
 from ..model.residual import Model, Pairs
-from ..model.unknowns import Layout, Unknowns, Variables
+from ..model.unknowns import AnyArray, Layout, Unknowns, Variables
 
 _ROWS_A_BLOCK = 24
 _ENTRIES_AT_ONCE = 1 << 22  # of the faces' matrices, likewise
@@ -67,16 +69,13 @@ class Patches(NamedTuple):
 
 
 class Derivatives(NamedTuple):
-    """Values at the start of a sweep, and their derivatives by the unknowns of the control faces that they lie in."""
+    """Values at the start of a sweep, and their derivatives along the seeds of the elements, the last seed included."""
 
     surface: Float[Array, "v 3"]
     rows: Float[Array, "m"]
     """Of the face priors, one after the other."""
-    by_rows: Float[Array, "m d"]
-    by_surface: Float[Array, "f w d 3"]
-    """Of the vertices of the patches."""
-    along: tuple[Float[Array, "v 3"], Float[Array, "m"]]
-    """Of all vertices, and of the rows, along the last seed."""
+    of_surface: Float[Array, "v 3 s"]
+    of_rows: Float[Array, "m s"]
 
 
 def face_corners(faces: dict[int, Any]) -> Int[np.ndarray, "g 4"]:
@@ -146,52 +145,81 @@ def surface_and_rows(model: Model, y: Variables, offset: Unknowns, held: dict[st
 
 @eqx.filter_jit
 def differentiate(
-    model: Model,
-    y: Variables,
-    held: dict[str, Any],
-    seeds: Float[Array | np.ndarray, "s n"],
-    seeds_of: Int[Array | np.ndarray, "f d"],
-    row_faces: Int[Array | np.ndarray, "m"],
-    patches: Int[Array | np.ndarray, "f w"],
+    model: Model, y: Variables, held: dict[str, Any], seeds: Float[Array | np.ndarray, "s n"]
 ) -> Derivatives:
     """The surface and the rows of the face priors at the start of a sweep, and their derivatives.
 
     Args:
         held: what each prior holds.
-        seeds: see `Elements`; so is `seeds_of`.
-        row_faces: the control face of every row.
-        patches: the vertices of the surface over every control face.
+        seeds: see `Elements`.
     """
     dtype, split = y.control.vertices.dtype, model.layout.split
     zero = split(jnp.zeros(model.layout.n, dtype))
     (surface, rows), derivative = jax.linearize(lambda offset: surface_and_rows(model, y, offset, held), zero)
     of_surface, of_rows = jax.lax.map(lambda seed: derivative(split(seed)), jnp.asarray(seeds, dtype))
-    by_rows = jnp.take_along_axis(of_rows.T, jnp.asarray(seeds_of)[row_faces], axis=1)
-    by_surface = of_surface[jnp.asarray(seeds_of)[:, None, :], jnp.asarray(patches)[:, :, None]]
-    return Derivatives(surface, rows, by_rows, by_surface, (of_surface[-1], of_rows[-1]))
+    return Derivatives(surface, rows, jnp.moveaxis(of_surface, 0, -1), of_rows.T)
 
 
 @eqx.filter_jit
 def differentiate_across(
     model: Model, y: Variables, seeds: Float[Array | np.ndarray, "s n"], normals: Float[Array, "v 3"]
-) -> Float[Array, "s v"]:
+) -> Float[Array, "v s"]:
     """How far each vertex of the surface moves along its normal, for a move of the unknowns along each seed."""
     dtype, split = y.control.vertices.dtype, model.layout.split
     zero = split(jnp.zeros(model.layout.n, dtype))
     _, derivative = jax.linearize(lambda offset: model.refine(model.retract(y, offset)).vertices, zero)
-    return jax.lax.map(lambda seed: jnp.sum(derivative(split(seed)) * normals, axis=1), jnp.asarray(seeds, dtype))
+    across = jax.lax.map(lambda seed: jnp.sum(derivative(split(seed)) * normals, axis=1), jnp.asarray(seeds, dtype))
+    return across.T
 
 
 def forgets_some(elements: Elements, patches: Patches, found: Derivatives, row_faces: Int[np.ndarray, "m"]) -> bool:
     """Whether values depend on unknowns that the elements do not know: seen in the derivative along the last seed."""
-    seed = np.append(elements.seeds[-1, : elements.n], 0.0)[elements.columns]
-    of_surface, of_rows = (np.asarray(part) for part in found.along)
-    by_surface = np.einsum("fwdx,fd->fwx", np.asarray(found.by_surface), seed)
+    of_surface, of_rows = np.asarray(found.of_surface), np.asarray(found.of_rows)
+    # How far each unknown of a face goes along the last seed, at the seed that the face knows it by.
+    parts = np.zeros((len(elements.columns), len(elements.seeds)), of_surface.dtype)
+    last = np.append(elements.seeds[-1, : elements.n], 0.0)[elements.columns]
+    np.add.at(parts, (np.arange(len(parts))[:, None], elements.seeds_of), last)
+    n, w = patches.vertices.shape
+    of_patches = of_surface[patches.vertices].reshape(n, 3 * w, -1) @ parts[..., None]
     corners = patches.owner[:, None], patches.slots
-    surface = by_surface[corners] - of_surface[patches.vertices[corners]]
-    rows = np.einsum("md,md->m", np.asarray(found.by_rows), seed[row_faces]) - of_rows
-    both = ((surface, of_surface), (rows, of_rows))
+    surface = of_patches.reshape(n, w, 3)[corners] - of_surface[patches.vertices[corners], :, -1]
+    rows = np.einsum("ms,ms->m", of_rows, parts[row_faces]) - of_rows[:, -1]
+    both = ((surface, of_surface[:, :, -1]), (rows, of_rows[:, -1]))
     return any(np.abs(off).max(initial=0) > _WRONG * np.abs(of).max(initial=0) for off, of in both)
+
+
+def slopes_of_rows(
+    elements: Elements, of_rows: Float[AnyArray, "m s"], face: Int[np.ndarray, "m"]
+) -> Float[np.ndarray, "m d"]:
+    """Derivatives of rows by the unknowns of their faces, from those along the seeds."""
+    slopes = np.take_along_axis(np.asarray(of_rows), elements.seeds_of[face], axis=1)
+    return slopes.astype(np.float64)
+
+
+def slopes_of_distances(
+    elements: Elements, patches: Patches, found: Derivatives, pairs: Pairs, at: Int[np.ndarray, "p"]
+) -> Float[np.ndarray, "p d"]:
+    """Derivatives of the distances of pairs by the unknowns of their faces.
+
+    Args:
+        at: the face of the surface of each pair.
+    """
+    of_surface, n = np.asarray(found.of_surface), len(at)
+    weights, directions = (np.asarray(part, of_surface.dtype) for part in (pairs.corner_weights, pairs.directions))
+    factors = weights[:, :, None] * directions[:, None, :]
+    coordinate = 3 * np.asarray(pairs.corners)[:, :, None] + np.arange(3)
+    by_coordinates = sp.csr_array(
+        (factors.ravel(), coordinate.ravel(), 12 * np.arange(n + 1)), shape=(n, 3 * len(of_surface))
+    )
+    along = by_coordinates @ of_surface.reshape(3 * len(of_surface), -1)
+    return slopes_of_rows(elements, along, patches.owner[at])
+
+
+def are_many(elements: Elements, patches: Patches, n_points: int) -> bool:
+    """Whether points are so many that their distances are summed up by patches at less cost than one by one."""
+    n_faces, d = elements.columns.shape
+    width = 3 * patches.vertices.shape[1]
+    return n_points * d > n_faces * width * (width + d)
 
 
 def normal_matrix(
@@ -247,12 +275,12 @@ class _Sums:
 def distance_matrix(
     elements: Elements,
     patches: Patches,
-    by_surface: Float[Array, "f w d 3"],
+    found: Derivatives,
     pairs: Pairs,
     weights: Float[np.ndarray, "p"],
     at: Int[np.ndarray, "p"],
 ) -> Float[np.ndarray, "_"]:
-    """Values of J' W J for the distances of pairs, in the pattern of the elements.
+    """Values of J' W J for the distances of many pairs, in the pattern of the elements.
 
     A distance depends on three or four vertices of the surface. What the pairs of a patch say of its vertices is summed
     up first, and then taken to the unknowns, once a patch and not once a pair.
@@ -260,26 +288,35 @@ def distance_matrix(
     Args:
         at: the face of the surface of each pair.
     """
-    width, d = 3 * patches.vertices.shape[1], elements.columns.shape[1]
-    face, sums = patches.owner[at], _Sums(elements)
+    width, sums = 3 * patches.vertices.shape[1], _Sums(elements)
+    face = patches.owner[at]
     order = np.argsort(face, kind="stable")
     for run in elements.runs:
         those = run.faces
         n = those.stop - those.start
         rows = order[slice(*np.searchsorted(face, (those.start, those.stop), sorter=order))]
-        coordinate, factors = pair_factors(patches, pairs, at, rows)
+        coordinate, factors = _pair_factors(patches, pairs, at, rows)
         place = (face[rows, None] - those.start) * width + coordinate
         inner = np.bincount(
             (place[:, :, None] * width + coordinate[:, None, :]).ravel(),
             ((factors * weights[rows, None])[:, :, None] * factors[:, None, :]).ravel(),
             n * width * width,
         ).reshape(n, width, width)
-        by = np.asarray(by_surface[those], np.float64).transpose(0, 1, 3, 2).reshape(n, width, d)
+        by = _slopes_of_patches(elements, patches, found, those)
         sums.add(run, _products(by.transpose(0, 2, 1), _products(inner, by)))
     return sums.values()
 
 
-def pair_factors(
+def _slopes_of_patches(
+    elements: Elements, patches: Patches, found: Derivatives, those: slice
+) -> Float[np.ndarray, "f c d"]:
+    """Derivatives of the vertices of some patches by the unknowns of their faces."""
+    vertices, seeds_of = patches.vertices[those], elements.seeds_of[those]
+    place = vertices[:, :, None, None], np.arange(3)[:, None], seeds_of[:, None, None, :]
+    return np.asarray(found.of_surface)[place].astype(np.float64).reshape(len(vertices), -1, seeds_of.shape[1])
+
+
+def _pair_factors(
     patches: Patches, pairs: Pairs, at: Int[np.ndarray, "p"], rows: Int[np.ndarray, "r"]
 ) -> tuple[Int[np.ndarray, "r 12"], Float[np.ndarray, "r 12"]]:
     """The coordinates of its patch that each distance depends on, and by what factors."""
@@ -293,25 +330,27 @@ def pair_factors(
 def distances_transposed(
     elements: Elements,
     patches: Patches,
-    by_surface: Float[Array, "f w d 3"],
+    found: Derivatives,
     pairs: Pairs,
     values: sp.csr_array,
     at: Int[np.ndarray, "p"],
 ) -> Float[np.ndarray, "n k"]:
-    """J' times values of pairs `[p, k]`, J being the derivatives of their distances; see `distance_matrix`."""
-    coordinate, factors = pair_factors(patches, pairs, at, np.arange(len(at)))
+    """J' times values of many pairs `[p, k]`, J being the derivatives of their distances; see `distance_matrix`."""
+    coordinate, factors = _pair_factors(patches, pairs, at, np.arange(len(at)))
     f, w = patches.vertices.shape
     place = patches.owner[at][:, None] * (3 * w) + coordinate
     ends = np.arange(0, factors.size + 1, 12)
     by_coordinates = sp.csr_array((factors.ravel(), place.ravel(), ends), shape=(len(at), 3 * w * f))
     sides = (by_coordinates.T @ values).toarray().reshape(f, 3 * w, -1)
-    by = np.asarray(by_surface, np.float64).transpose(0, 1, 3, 2).reshape(f, 3 * w, -1)
-    of_faces = by.transpose(0, 2, 1) @ sides
+    of_faces = [
+        _slopes_of_patches(elements, patches, found, run.faces).transpose(0, 2, 1) @ sides[run.faces]
+        for run in elements.runs
+    ]
     columns = elements.columns.ravel()
     gather = sp.csr_array(
         (np.ones(len(columns)), columns, np.arange(len(columns) + 1)), shape=(len(columns), elements.n + 1)
     )
-    return (gather.T @ of_faces.reshape(len(columns), -1))[:-1]
+    return (gather.T @ np.concatenate(of_faces).reshape(len(columns), -1))[:-1]
 
 
 def times_transposed(
@@ -346,15 +385,26 @@ def _vertices_near_faces(topology: js.Topology, rings: int) -> sp.csr_array:
 
 
 def colour(near: sp.csr_array) -> Int[np.ndarray, "v"]:
-    """A colour for every vertex, so that no two in one face have the same: greedily, the crowded ones first."""
+    """A colour for every vertex, so that no two in one face have the same: next the one beside most colours (DSATUR).
+
+    Source: D. Brelaz, New methods to color the vertices of a graph, 1979.
+    """
     together = (near.T @ near).tocsr()
-    colour = np.full(len(together.indptr) - 1, -1)
-    for vertex in np.argsort(-np.diff(together.indptr), kind="stable"):
-        taken = colour[together.indices[together.indptr[vertex] : together.indptr[vertex + 1]]]
-        free = np.ones(len(taken) + 1, bool)
-        free[taken[(taken >= 0) & (taken < len(free))]] = False
-        colour[vertex] = np.argmax(free)
-    return colour
+    beside = np.split(together.indices, together.indptr[1:-1])
+    colours, taken = np.full(len(beside), -1), [set() for _ in beside]
+    queue = [(0, -len(others), vertex) for vertex, others in enumerate(beside)]
+    heapq.heapify(queue)
+    while queue:
+        n_taken, _, vertex = heapq.heappop(queue)
+        if colours[vertex] >= 0 or -n_taken != len(taken[vertex]):
+            continue  # done, or queued again since with more colours beside it
+        found = next(number for number in itertools.count() if number not in taken[vertex])
+        colours[vertex] = found
+        for other in beside[vertex].tolist():
+            if colours[other] < 0 and found not in taken[other]:
+                taken[other].add(found)
+                heapq.heappush(queue, (-len(taken[other]), -len(beside[other]), other))
+    return colours
 
 
 def _pattern(columns: Int[np.ndarray, "f d"], n: int) -> tuple[sp.csc_array, list[Run]]:

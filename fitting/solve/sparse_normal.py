@@ -28,6 +28,7 @@ from .cholesky import analyse as analyse_pattern
 from .elements import (
     Elements,
     Patches,
+    are_many,
     colour,
     differentiate,
     distance_matrix,
@@ -37,6 +38,8 @@ from .elements import (
     forgets_some,
     jacobian,
     normal_matrix,
+    slopes_of_distances,
+    slopes_of_rows,
     times_transposed,
 )
 
@@ -168,7 +171,7 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> Structur
     rows = row_faces(model, held)
     for rings in range(1, _MOST_RINGS + 1):
         elements = find_elements(model, rings)
-        found = differentiate(model, y, held, elements.seeds, elements.seeds_of, rows, patches.vertices)
+        found = differentiate(model, y, held, elements.seeds)
         if not forgets_some(elements, patches, found, rows):
             break
     else:
@@ -260,8 +263,7 @@ class SparseEquations:
         self.values: dict[str, Float[np.ndarray, "m"]] = {}
         """Rows of each prior, before they are weighed."""
         self._row_faces = row_faces(model, held.priors)
-        tables = structure.elements.seeds, structure.elements.seeds_of, self._row_faces, structure.patches.vertices
-        self.found = differentiate(bare, y, held.priors, *tables)
+        self.found = differentiate(bare, y, held.priors, structure.elements.seeds)
         self._by: dict[str, Float[np.ndarray, "m d"]] = {}
         self._tied_jacobians: dict[str, sp.csr_array] = {}
         self._known: dict[tuple[str, bytes], ArrowheadFactor] = {}
@@ -371,20 +373,21 @@ class SparseEquations:
     def _add_distances(self) -> Arrowhead:
         """The scan's matrix; its gradient is added to that of all."""
         structure, held, n = self.structure, self.held, self.structure.n
-        elements, patches, by_surface = structure.elements, structure.patches, self.found.by_surface
-        weights, pairs, at = np.asarray(held.distance_precisions, np.float64), held.pairs, np.asarray(held.faces)
-        distances = np.asarray(_measure_distances(self.found.surface, pairs), np.float64)
+        elements, n_h = structure.elements, structure.elements.n - n
+        weights = np.asarray(held.distance_precisions, np.float64)
+        distances = np.asarray(_measure_distances(self.found.surface, held.pairs), np.float64)
         self.values["distance"] = distances
-        pulls = sp.csr_array((weights * distances)[:, None])
-        self.gradient[: elements.n] += distances_transposed(elements, patches, by_surface, pairs, pulls, at)[:, 0]
-        found = structure.arrange(distance_matrix(elements, patches, by_surface, pairs, weights, at), self._n_shared)
-        if held.of_points is None:
-            return found
-        # How the shifts of slices and the other unknowns move distances together: by way of the patches' vertices.
         by_shifts = self._shift_derivatives()
         weighed = sp.csr_array(sp.diags_array(weights) @ by_shifts)
-        across = distances_transposed(elements, patches, by_surface, pairs, weighed, at)
-        columns, n_h = self.model.layout.columns("shifts"), elements.n - n
+        sides = sp.csr_array(sp.hstack([(weights * distances)[:, None], weighed]))
+        matrix, across = self._multiply_distances(weights, sides)
+        self.gradient[: elements.n] += across[:, 0]
+        found = structure.arrange(matrix, self._n_shared)
+        if held.of_points is None:
+            return found
+        # How the shifts of slices and the other unknowns move distances together.
+        across = across[:, 1:]
+        columns = self.model.layout.columns("shifts")
         shifts = slice(columns.start - n, columns.stop - n)
         found.border[:, shifts] += across[:n]
         found.corner[:n_h, shifts] += across[n:]
@@ -393,10 +396,23 @@ class SparseEquations:
         self.gradient[columns] += weighed.T @ distances
         return found
 
+    def _multiply_distances(
+        self, weights: Float[np.ndarray, "p"], sides: sp.csr_array
+    ) -> tuple[Float[np.ndarray, "_"], Float[np.ndarray, "n k"]]:
+        """J' W J in the pattern of the elements and J' times values `[p, k]`, J being the distances' derivatives."""
+        elements, patches, at = self.structure.elements, self.structure.patches, np.asarray(self.held.faces)
+        of_pairs = elements, patches, self.found, self.held.pairs
+        if are_many(elements, patches, len(at)):
+            return distance_matrix(*of_pairs, weights, at), distances_transposed(*of_pairs, sides, at)
+        face, by = patches.owner[at], slopes_of_distances(*of_pairs, at)
+        return normal_matrix(elements, by, weights, face), (jacobian(elements, by, face).T @ sides).toarray()
+
     def _shift_derivatives(self) -> sp.csr_array:
-        """Of the distances by the shifts, slice by slice."""
+        """Of the distances by the shifts, slice by slice; without columns where no slice may be shifted."""
         prior, held = self.model.prior("shift"), self.held
-        assert isinstance(prior, ShiftPrior) and held.of_points is not None
+        if held.of_points is None:
+            return sp.csr_array((len(held.distance_precisions), 0))
+        assert isinstance(prior, ShiftPrior)
         of_points = np.asarray(held.of_points)
         moves = np.flatnonzero(of_points >= 0)
         row = of_points[moves]
@@ -408,7 +424,8 @@ class SparseEquations:
 
     def _add_face_priors(self) -> Arrowhead:
         elements, held = self.structure.elements, self.held
-        rows, by = (np.asarray(part, np.float64) for part in (self.found.rows, self.found.by_rows))
+        rows = np.asarray(self.found.rows, np.float64)
+        by = slopes_of_rows(elements, self.found.of_rows, self._row_faces)
         first, weights = 0, [np.zeros(0)]
         self._rows_of: dict[str, slice] = {}
         for prior in self.model.face_priors:
@@ -496,7 +513,7 @@ def _solve(
     face, n = np.asarray(faces), structure.layout.n
     elements, n_shared = structure.elements, structure.layout.n - structure.n
     left, slopes = np.asarray(rows, np.float64), np.asarray(by, np.float64)
-    local = np.take_along_axis(slopes.T, elements.seeds_of[face], axis=1)
+    local = slopes_of_rows(elements, slopes.T, face)
     gradient = np.zeros(n)
     gradient[: elements.n] = times_transposed(elements, local, left, face)
     matrix = structure.arrange(normal_matrix(elements, local, np.ones(len(left)), face), n_shared)

@@ -28,7 +28,6 @@ from ..model.residual import Held, Model, Residual
 from ..model.robust import AbstractLoss, geman_mcclure
 from ..model.unknowns import AnyArray, Variables
 from ..scan.closest_points import closest_points
-from ..scan.search_closest import search_closest
 from ..start.folds import Folds
 from .conjugate_gradients import ConjugateGradients
 from .sparse_normal import SparseNormal
@@ -161,7 +160,7 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
         (model, scene), xp = args, np if self._on_host else jnp
         surface = js.RefinedSurface(state.vertices, state.normals, model.topology.faces)
         held, points = hold_priors(model, y, surface, state.strengths.values, scene)
-        search = closest_points if self._on_host else search_closest
+        search = closest_points if self._on_host else js.search_closest
         at = search(surface, points, scene.choice)
         k, least = state.sweep, LEAST_NOISE * model.edge
         fallen = jnp.maximum(jnp.asarray(state.widest) * 0.5 ** jnp.asarray(k, model.edge.dtype), least)
@@ -310,7 +309,7 @@ def subject_residual(y: Variables, subject: Subject) -> dict[str, Float[Array, "
     model, scene = subject
     surface, strengths = model.refine(y), first_strengths(model)
     held, points = hold_priors(model, y, surface, strengths.values, scene)
-    at = search_closest(surface, points, scene.choice)
+    at = js.search_closest(surface, points, scene.choice)
     look = measure(surface, scene, points, at, model.edge, LEAST_NOISE * model.edge, geman_mcclure())
     return Residual(model)(y, hold_sweep(model, y, scene, look, at, strengths, held, jnp))
 

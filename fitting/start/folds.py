@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 import jaxsubdiv as js
+from jaxsubdiv.closest import AnyArray
 from jaxsubdiv.errors import name_rows
 from jaxsubdiv.half_edges import HalfEdges, half_edges
 from jaxsubdiv.notices import warn
 
-from ..scan.closest_points import AnyArray
 from .remesh import averages
 
 _FOLDED = -0.5  # cosine between the normals of two faces that are folded onto each other; -1/3 in a tetrahedron

@@ -8,9 +8,9 @@ the octree that those libraries need for detail has no use here, where the surfa
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # its parts are loaded where they are used
 from jaxtyping import Float
 from scipy.fft import dctn, idctn
-from scipy.ndimage import map_coordinates
 
 _PAD = 0.12  # of the longest side: room for what bulges out of a hole
 
@@ -24,7 +24,9 @@ class Implicit(NamedTuple):
 
     def at(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p"]:
         """Values between the nodes, trilinear."""
-        return map_coordinates(self.values, ((points - self.origin) / self.cell).T, order=1, mode="nearest")
+        return scipy.ndimage.map_coordinates(
+            self.values, ((points - self.origin) / self.cell).T, order=1, mode="nearest"
+        )
 
     def outward(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
         """Down the gradient, by differences over a cell; not of unit length."""

@@ -219,7 +219,7 @@ def _edge_normal_sums(
         on_boundary = is_boundary(level, n_old)
 
         def of_nobody(values: Float[Array, "v 6"]) -> Float[Array, "e 3"]:
-            return jnp.zeros((n_edges, 3), values.dtype)
+            return jnp.broadcast_to(0 * lax.stop_gradient(values[:1, :3]), (n_edges, 3))  # as in `_unit_normals`
 
         of_edges = jax.checkpoint(partial(edge_chord_normals, level))
         chord = apart(lax.cond(jnp.any(on_boundary), of_edges, of_nobody, values)[None])
@@ -254,7 +254,8 @@ def _unit_normals(sums: Float[Array, "4 m"], n: Float[Array, "v 3"], parents: In
         return unit(sum(others, first))[0]
 
     def of_nobody(n: Float[Array, "v 3"]) -> Float[Array, "m 3"]:
-        return jnp.zeros((sums.shape[1], 3), n.dtype)
+        # Zeros that under `shard_map` vary over devices as the other branch does.
+        return jnp.broadcast_to(0 * lax.stop_gradient(n[:1]), (sums.shape[1], 3))
 
     # The parents are looked up only where some sum vanishes: in most meshes none does.
     instead = lax.cond(jnp.all(there), of_nobody, jax.checkpoint(of_parents), n)

@@ -18,6 +18,7 @@ from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
@@ -220,19 +221,16 @@ def judge(
     kept, right = result.inliers, problem.of_head
     f1 = 2 * np.sum(kept & right) / (np.sum(kept) + np.sum(right))
     vertices = np.asarray(result.surface.vertices, np.float64)
-    on, areas = nearest(truth, vertices).points, fitting.report.coverage.vertex_areas(result.surface)
+    on, areas = nearest(truth, vertices).points, np.asarray(result.surface.vertex_areas(), float)
     known = areas * (np.linalg.norm(on - centre, axis=1) >= radius)
     within = np.linalg.norm(on - vertices, axis=1) <= result.uncertainty().surface
     return Judgement(float(f1), float(np.sum(known * within) / np.sum(known)), crossing_faces(surface_of(result)))
 
 
 def crossing_faces(surface: Trimesh) -> float:
-    import pymeshlab
-
-    meshes = pymeshlab.MeshSet(verbose=False)
-    meshes.add_mesh(pymeshlab.Mesh(surface.vertices, surface.faces))
-    meshes.compute_selection_by_self_intersections_per_face()
-    return float(meshes.current_mesh().selected_face_number())
+    vertices = jnp.asarray(surface.vertices)
+    faces = {3: jnp.asarray(surface.faces, jnp.int32), 4: jnp.zeros((0, 4), jnp.int32)}
+    return float(len(js.find_crossings(js.RefinedSurface(vertices, jnp.zeros_like(vertices), faces)).triangles))
 
 
 def rms(values: np.ndarray) -> float:

@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 from fit_protocol import DATA, rms
-from fit_real import self_intersecting
 
 import fitting
 import jaxsubdiv as js
@@ -51,8 +50,8 @@ def row(scan: fitting.Scan, mesh: js.ControlMesh, way: str, shifts: bool, levels
     median = [np.median(away[1][rows]) for rows in of]
     cells = [" / ".join(f"{rms(distances[rows]):.2f}" for rows in of) for distances in away]
     cells.append(" / ".join(f"{value:.2f}" for value in median))
-    crossing = self_intersecting(found)
-    share = "" if crossing is None else f"{crossing / len(found.surface.triangles()):.2%}"
+    crossing = len(found.crossings.triangles)
+    share = f"{crossing / found.crossings.n_triangles:.2%}"
     report = found.report()
     ended = "" if report.converged else ", not at rest"
     return [*cells, f"{report.noise:.2f}", share, f"{report.sweeps}{ended}", f"{seconds:.0f}"]

@@ -9,11 +9,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 import jaxsubdiv as js
+from jaxsubdiv.closest import triangle_distance
 from jaxsubdiv.errors import name_rows
 from jaxsubdiv.half_edges import half_edges
 from jaxsubdiv.linalg import cross, dot, norm, take, unit
 
-from ...scan.closest_points import triangle_distance
 from ...scan.scan import ScanError
 from ..unknowns import AnyArray
 from .base import AbstractFacePrior, Place, Start

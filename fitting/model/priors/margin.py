@@ -4,11 +4,10 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsubdiv.linalg import cross, dot, take, unit
+import jaxsubdiv as js
 
 from ..unknowns import AnyArray
 from .base import AbstractFacePrior, Place, Start
@@ -33,14 +32,7 @@ class Margin(AbstractFacePrior):
 
     def rows(self, place: Place, held: None) -> Float[Array, "m"]:
         """One a corner of the control faces, over its own standard deviation."""
-        rows, normals = [], unit(place.control.normals)
-        for _, faces in sorted(place.topology.control_faces.items()):
-            corners = take(
-                place.control.vertices, faces
-            )  # at once: every gather is a loop to compile in the derivative
-            after, before = (jnp.roll(corners, step, axis=1) - corners for step in (-1, 1))
-            rows.append(dot(take(normals, faces), unit(cross(after, before)))[..., 0].T.reshape(-1))
-        margin = jnp.concatenate(rows)
+        margin = js.corner_cosines(place.control.vertices, place.control.normals, place.topology.control_faces)
         return jax.nn.softplus((_MARGIN - margin) / _SOFTNESS) * (_SOFTNESS / _SPREAD)
 
     def precisions(self, strengths: dict[str, Any]) -> Any:

@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 import jaxsubdiv as js
+from jaxsubdiv.closest import AnyArray
 from jaxsubdiv.errors import name_rows
 from jaxsubdiv.half_edges import half_edges
 from jaxsubdiv.linalg import unit
 
-from ...scan.closest_points import AnyArray
 from ..unknowns import Shared, tangents
 from .base import AbstractVertexPrior, Place, Start
 

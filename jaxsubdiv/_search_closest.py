@@ -14,11 +14,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-import jaxsubdiv as js
-from jaxsubdiv.linalg import cross, dot, norm, unit
-
-from .closest_points import polish, to_faces, triangle_choice, triangle_distance
-from .regions import Choice
+from ._surface import RefinedSurface, SurfacePoint
+from .closest import FaceChoice, polish, to_faces, triangle_choice, triangle_distance
+from .linalg import cross, dot, norm, unit
 
 _ROUNDING = 16.0  # times the precision of the numbers: by so much a bound is too large at most
 
@@ -47,17 +45,17 @@ class _Found(NamedTuple):
 
 @partial(jax.jit, static_argnames=("memory", "patch"))
 def search_closest(
-    surface: js.RefinedSurface,
+    surface: RefinedSurface,
     points: Float[Array, "p 3"],
-    choice: Choice | None = None,
+    choice: FaceChoice | None = None,
     *,
     memory: int = 1 << 25,
     patch: int = 16,
-) -> js.SurfacePoint:
+) -> SurfacePoint:
     """Closest surface point of every point, as `closest_points` finds it on the host, under `jit` and `vmap`.
 
     Exact: the same distances to rounding, on surfaces of any kind; only where two faces are equally near may it be the
-    other one. It works in the dtype of the surface, and has no derivative: `js.evaluate` has one, at fixed places.
+    other one. It works in the dtype of the surface, and has no derivative: `evaluate` has one, at fixed places.
 
     Every point is held against a bound of every patch, so that the time grows with points times faces. It is made for
     programs that must not leave the device; on the host, and on large surfaces, `closest_points` is faster.
@@ -91,7 +89,7 @@ def search_closest(
     if len(quads):
         corners = vertices[quads[jnp.maximum(face - n_triangles, 0)]]
         uv = jnp.where((face >= n_triangles)[:, None], polish(corners, points, uv, jnp), uv)
-    return js.SurfacePoint(face, uv)
+    return SurfacePoint(face, uv)
 
 
 def _patches(vertices: Float[Array, "v 3"], triangles: Int[Array, "s 3"], patch: int) -> _Patches:
@@ -140,7 +138,11 @@ def _search(
             jnp.where(nearer, jnp.stack([u[best], v[best]]), found.uv),
         )
 
-    none = _Found(jnp.min(keys), jnp.full((), jnp.inf, point.dtype), jnp.int32(0), jnp.zeros(2, point.dtype))
+    # Nothing found yet; made from the arguments, so that under `shard_map` it varies over devices as they do.
+    first = jnp.min(keys)
+    nothing = (first & 0).astype(jnp.int32)
+    zero = nothing.astype(point.dtype)
+    none = _Found(first, zero + jnp.inf, nothing, jnp.stack([zero, zero]))
     found = lax.while_loop(closer, look, none)
     return found.triangle, found.uv
 

@@ -1,0 +1,1 @@
+"""The command `jaxsubdiv-fit`: its options, and what they ask for."""

@@ -1,0 +1,56 @@
+"""`jaxsubdiv-fit`: what the options ask for, done."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxsubdiv.console import lasting_streams, plain_warnings
+
+from ..run.names import name_folder
+from ..run.surface_files import check_formats
+from .inputs import find_sources
+from .many import fit_all
+from .messages import report_failure
+from .one import fit_one
+from .options import check_options, make_parser, make_recipe
+from .programs import keep_compiled_programs
+from .template import make_template_of_all
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line: exit status 0, 1 for a fit not to be trusted, 2 for an input of no use, 130 where stopped."""
+    with lasting_streams(), plain_warnings():
+        return _main(arguments)
+
+
+def _main(arguments: Sequence[str] | None) -> int:
+    parser = make_parser()
+    options = parser.parse_args(arguments)
+    if (options.control or options.prior) and not options.scans:
+        which = "--control" if options.control else "--prior"
+        parser.error(f"a control mesh needs a scan to be fitted to: give SCAN to {which}")
+    if options.labels and not options.scans:
+        parser.error("labels are those of a scan: give SCAN before --labels, which takes all the words that follow")
+    if options.carry and not options.control:
+        parser.error("--carry takes landmarks of a template to the scan: give the template, --control MESH")
+    if options.template_out and (options.control or options.prior or not options.scans):
+        parser.error("--template-out makes a template of scans: give scans, and neither --control nor --prior")
+    keep_compiled_programs()
+    try:
+        check_options(options)
+        scans, recipe = find_sources(options), make_recipe(options)
+        check_formats(options.surface)
+    except (ValueError, OSError, ImportError) as error:
+        return report_failure(error)
+    try:
+        if options.template_out:
+            return make_template_of_all(scans, options, recipe)
+        if len(scans) > 1:
+            return fit_all(scans, options, recipe)
+        scan = scans[0] if scans else None
+        folder = Path(options.output or (name_folder(scan.as_file) if scan else f"fit_{options.example}"))
+        return fit_one(scan, folder, options, recipe, scan.title() if scan else options.example)["status"]
+    except KeyboardInterrupt:
+        skips = "; with --resume it skips the scans that are done" if len(scans) > 1 else ""
+        print(f"\nstopped  the same command goes on from the last sweep{skips}", file=sys.stderr)
+        return 130

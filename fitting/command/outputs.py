@@ -1,0 +1,65 @@
+"""The files of one fit."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+import jaxsubdiv as js
+from jaxsubdiv.frames import Frame
+
+from ..image.slices import Slice, cut_slices
+from ..report.page import write_page
+from ..report.picture import draw_fit
+from ..report.result import FitResult
+from ..report.saved import save_fit
+from ..run.carry import carry_landmarks
+from ..run.fit_scan import ScanFit
+from ..run.folder import CARRIED, LANDMARKS, filling
+from ..run.surface_files import write_surface
+from ..scan.landmarks import write_landmarks
+from .inputs import Job
+
+
+def save_outputs(
+    folder: Path, found: ScanFit, title: str, marks: dict[str, str], job: Job, options: argparse.Namespace
+) -> None:
+    """The fit as files, all of them in place of those of an earlier one, or none."""
+    result, frame = found.result, job.scan.frame or (job.carried.frame if job.carried is not None else None)
+    slices = cut_job_slices(job, result)
+    with filling(folder) as new:
+        js.write_mesh(new / "control.obj", result.control_mesh, frame=frame)
+        written = ["control.obj", *_write_surface(new, result, options, frame)]
+        written += ["report.json", "fit.html", "fit.npz", "recipe.json"]
+        if job.carried is not None and job.mesh is not None:
+            there = carry_landmarks(job.mesh, result, job.carried.positions)
+            for name in (LANDMARKS, CARRIED):
+                write_landmarks(new / name, there.positions, frame=frame, deviations=there.deviations)
+                written.append(name)
+        (new / "report.json").write_text(result.report(uncertainty=True).as_json() + "\n", encoding="utf-8")
+        write_page(new / "fit.html", result, title=title, start=found.start, slices=slices)
+        assert result.recipe is not None
+        save_fit(new, result.fit, result.recipe, marks)
+        try:
+            draw_fit(result, found.start, title=title, slices=slices).savefig(new / "fit.png")
+            written.append("fit.png")
+        except ImportError as error:
+            print(f"note     no picture: {error}")
+    print(f"wrote    {', '.join(written)} in {folder}")
+
+
+def _write_surface(folder: Path, result: FitResult, options: argparse.Namespace, frame: Frame | None) -> list[str]:
+    """The surface's files; where it has no such level, told, none: the fit itself is not lost."""
+    try:
+        return write_surface(folder, result.at_level(options.surface_level), options.surface, frame)
+    except (ValueError, MemoryError) as error:
+        print(f"note     no surface: {str(error) or 'it takes more memory than there is'}")
+        return []
+
+
+def cut_job_slices(job: Job, result: FitResult) -> Sequence[Slice]:
+    """Of the image, where there was one."""
+    if job.seen is None:
+        return ()
+    return cut_slices(job.seen.volume, np.asarray(result.surface.vertices, np.float64), label=job.seen.label)
