@@ -11,7 +11,6 @@ from schemes import control_mesh
 
 import jaxsubdiv as js
 from jaxsubdiv._padding import _SMALLEST, _sizes
-from jaxsubdiv._refine import _refine
 
 LEVELS = 2
 MIXED = control_mesh(meshes.grid(3, 2, "mixed", bumpy=0.2))
@@ -80,10 +79,9 @@ def test_meshes_of_a_class_share_one_program():
         {tuple(leaf.shape for leaf in jax.tree.leaves(t)) for _, t, *_ in given},
     )
     assert list(map(len, shapes)) == [1, 1]
-    found = [js.refine(scheme, *given[0][1::2])]
-    n = _refine._cache_size()
-    found += [js.refine(scheme, topology, control) for _, topology, _, control in given[1:]]
-    assert _refine._cache_size() == n
+    refine = jax.jit(js.refine)
+    found = [refine(scheme, topology, control) for _, topology, _, control in given]
+    assert refine._cache_size() == 1
     for (before, topology, alone, _), surface in zip(given, found, strict=True):
         assert_same(js.cut_padding(topology, surface), js.refine(scheme, before, alone))
 

@@ -148,7 +148,6 @@ class AbstractPointNormalScheme(AbstractScheme):
         level: Level,
         x: Float[Array, "v 3"],
         n: Float[Array, "v 3"],
-        edges: Edges,
         edge_points: Float[Array, "e 3"],
     ) -> Rows:
         """Positions of the face vertices, one in the middle of every quad."""
@@ -165,7 +164,7 @@ class AbstractPointNormalScheme(AbstractScheme):
         edge_points = _edge_points(self, h, level, values)
         if level.seams is not None:
             edge_points = on_seams(level, x, n, edge_points, h, self.seam_factor)
-        face_points = _face_points(self, h, level, x, n, values, edge_points)
+        face_points = _face_points(self, h, level, x, n, edge_points)
         refined = jnp.concatenate([x, edge_points, face_points])
         edge_normals = _unit_normals(_edge_normal_sums(self, level, values, refined), n, level.edges)
         face_normals = _unit_normals(_face_normal_sums(self, level, edge_points, face_points), n, level.quads)
@@ -192,10 +191,9 @@ def _face_points(
     level: Level,
     x: Float[Array, "v 3"],
     n: Float[Array, "v 3"],
-    values: Float[Array, "v 6"],
     edge_points: Float[Array, "e 3"],
 ) -> Float[Array, "q 3"]:
-    return together(scheme.face_points(h, level, x, n, gather_edges(level, values), edge_points))[0]
+    return together(scheme.face_points(h, level, x, n, edge_points))[0]
 
 
 @kept_apart
@@ -221,7 +219,7 @@ def _edge_normal_sums(
         on_boundary = is_boundary(level, n_old)
 
         def of_nobody(values: Float[Array, "v 6"]) -> Float[Array, "e 3"]:
-            return jnp.zeros((n_edges, 3), values.dtype)
+            return jnp.broadcast_to(0 * lax.stop_gradient(values[:1, :3]), (n_edges, 3))  # as in `_unit_normals`
 
         of_edges = jax.checkpoint(partial(edge_chord_normals, level))
         chord = apart(lax.cond(jnp.any(on_boundary), of_edges, of_nobody, values)[None])

@@ -66,7 +66,6 @@ class CirclePreserving(AbstractPointNormalScheme):
         level: Level,
         x: Float[Array, "v 3"],
         n: Float[Array, "v 3"],
-        edges: Edges,
         edge_points: Float[Array, "e 3"],
     ) -> Vectors:
         edge_normals = edge_chord_normals(level, jnp.concatenate([x, n], axis=1))
