@@ -11,6 +11,10 @@ from .image.volume import Label as Label
 from .image.volume import Volume as Volume
 from .image.volume import choose_label as choose_label
 from .image.volume import find_labels as find_labels
+from .model.groups import GroupDifference as GroupDifference
+from .model.groups import compare_groups as compare_groups
+from .model.mode_quality import ModeQuality as ModeQuality
+from .model.mode_quality import measure_modes as measure_modes
 from .model.modes import Modes as Modes
 from .model.modes import shape_modes as shape_modes
 from .model.priors import Priors as Priors
@@ -44,6 +48,7 @@ from .report.series_page import write_series_page as write_series_page
 from .report.series_table import SeriesTable as SeriesTable
 from .run.carry import CarriedLandmarks as CarriedLandmarks
 from .run.carry import carry_landmarks as carry_landmarks
+from .run.carry import carry_to_cohort as carry_to_cohort
 from .run.cohort import fit_cohort as fit_cohort
 from .run.fit import Sweep as Sweep
 from .run.fit_scan import ScanFit as ScanFit
@@ -52,8 +57,13 @@ from .run.recipe import Recipe as Recipe
 from .run.recipe import fit as fit
 from .run.recipe import fit_scan as fit_scan
 from .run.recipe import load as load
+from .run.recipe import load_cohort as load_cohort
 from .run.recipe import load_recipe as load_recipe
+from .run.regroup import Template as Template
+from .run.regroup import regroup as regroup
 from .run.series import fit_series as fit_series
+from .run.shape_files import write_shapes as write_shapes
+from .run.template import make_template as make_template
 from .scan.closest_points import closest_points as closest_points
 from .scan.example import example as example
 from .scan.landmarks import Landmarks as Landmarks

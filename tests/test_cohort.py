@@ -1,6 +1,8 @@
 """Many scans at once: each fit as a fit of its own, whatever the others are; and the modes of the shapes found."""
 
+import dataclasses
 import functools
+import json
 import warnings
 
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ import scans
 
 import fitting
 import jaxsubdiv as js
+from fitting.run.pilot import is_its_own_start
 
 N_SUBJECTS, SIZES = 3, (600, 500, 550)
 PRIORS = fitting.Priors(bend=0.5)
@@ -137,12 +140,87 @@ def test_result_is_that_of_a_fit(tmp_path):
     np.testing.assert_array_equal(fitting.load(tmp_path).control.vertices, result.control.vertices)
 
 
+def test_a_cohort_that_was_saved_is_the_same(tmp_path):
+    named = dataclasses.replace(cohort(), names=("c", "a", "b"))
+    named.save(tmp_path)
+    again = fitting.load_cohort(tmp_path)
+    assert again.names == ("c", "a", "b")  # in their order, not that of the alphabet
+    for name in ("converged", "sweeps", "noise", "rms", "robust_rms", "weights"):
+        own, new = np.asarray(getattr(named, name)), np.asarray(getattr(again, name))
+        np.testing.assert_array_equal(own[..., : new.shape[-1]], new)
+    np.testing.assert_array_equal(again.control.vertices, named.control.vertices)
+    np.testing.assert_array_equal(again.h, named.h)
+    np.testing.assert_allclose(again.surfaces.vertices, named.surfaces.vertices, atol=1e-12)
+    np.testing.assert_array_equal(again.scans[2].points, subjects()[2].points)
+    assert again.warnings == named.warnings
+    (tmp_path / "cohort.json").unlink()
+    assert fitting.load_cohort(tmp_path).names == ("a", "b", "c")
+
+
+def test_what_is_no_saved_cohort_is_told(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no folders with saved fits"):
+        fitting.load_cohort(tmp_path)
+    (tmp_path / "cohort.json").write_text('{"names": ["../a"]}')
+    with pytest.raises(ValueError, match=r"cohort\.json: '\.\./a' cannot name a scan"):
+        fitting.load_cohort(tmp_path)
+    with pytest.raises(ValueError, match="fit 1 has another control mesh"):
+        fitting.Cohort.of([cohort().result(0), plates()[1].result(0)])
+    with pytest.raises(ValueError, match="one fit or more"):
+        fitting.Cohort.of([])
+
+
 def test_smoothness_is_that_of_the_pilot():
-    problem = scans.problem()
-    pilot = fitting.fit(js.Interpolating(), problem.topology, start(), subjects()[0], throw=False)
-    found = fitted(priors=None, pilot=pilot)
+    found = fitted(priors=None, pilot=pilot())
     assert found.converged.all()
-    assert off(pilot.surface, surface(found, 0)) < 0.3 * off(truths()[0], pilot.surface)
+    assert off(pilot().surface, surface(found, 0)) < 0.3 * off(truths()[0], pilot().surface)
+
+
+@functools.cache
+def pilot() -> fitting.FitResult:
+    return fitting.fit(js.Interpolating(), scans.problem().topology, start(), subjects()[0], throw=False)
+
+
+def test_a_pilot_that_is_its_own_start_is_replaced():
+    """Its strengths would say that no subject differs from the first, and hold all at its shape."""
+    topology, control = scans.problem().topology, pilot().control
+    own = fitting.fit(js.Interpolating(), topology, control, subjects()[0], throw=False)
+    assert is_its_own_start(own) and not is_its_own_start(pilot())
+    with pytest.warns(UserWarning, match="fitted to the pilot's own scan before.*that of scan 2 was taken instead"):
+        found = fitting.fit_cohort(
+            js.Interpolating(), topology, control, subjects(), pilot=own, max_sweeps=40, tolerance=0.01
+        )
+    assert found.converged.all()
+    for i in range(N_SUBJECTS):
+        assert off(truths()[i], surface(found, i)) < 0.5
+
+
+def test_a_subject_that_the_priors_hold_far_off_has_not_converged():
+    flat = np.array([1.4, 0.6, 1.0])
+    chosen = [subjects()[0], *(fitting.Scan(np.asarray(scan.points) * flat) for scan in subjects()[1:])]
+    with pytest.warns(UserWarning, match="of the scans 1, 2"):
+        found = fitting.fit_cohort(
+            js.Interpolating(),
+            scans.problem().topology,
+            cohort().result(0).control,
+            chosen,
+            priors=fitting.Priors(bend=1e-7, stretch=1e-7),
+            max_sweeps=40,
+            tolerance=0.01,
+        )
+    np.testing.assert_array_equal(found.converged, [True, False, False])
+    assert "rests_where_it_started" in [finding.name for finding in found.warnings[1]]
+    assert not found.trusted[1:].any()
+    report = found.result(2).report()
+    assert not report.converged and report.reason == "at rest where it started, far from the scan"
+
+
+def test_every_subject_has_the_warnings_of_a_fit():
+    found = cohort()
+    single = fitting.fit(
+        js.Interpolating(), scans.problem().topology, start(), subjects()[0], priors=PRIORS, tolerance=0.01, throw=False
+    )
+    assert [finding.name for finding in found.warnings[0]] == [finding.name for finding in single.warnings]
+    np.testing.assert_array_equal(found.trusted, [not of_one for of_one in found.warnings])
 
 
 def test_every_prior_holds_as_in_a_fit():
@@ -201,6 +279,41 @@ def test_boundary_curves_hold_as_in_a_fit():
             np.testing.assert_allclose(np.abs(rows[outside, :2] - 10).max(axis=1), 11, atol=0.05)
 
 
+@functools.cache
+def plates() -> tuple[fitting.RegionMatch, fitting.Cohort]:
+    """A plate whose lower wall lies nearer to where its upper one starts: labels alone tell upper from lower."""
+    corners = [(1, 0, 0), (0, 1, 0), (-1, 0, 0), (0, -1, 0), (0, 0, 0.1), (0, 0, -0.1)]
+    faces = [(0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4), (1, 0, 5), (2, 1, 5), (3, 2, 5), (0, 3, 5)]
+    walls = js.Regions(np.repeat([0, 1], 4), ("upper", "lower"))
+    mesh = js.ControlMesh(10 * np.array(corners), faces, regions=walls)
+    topology = js.build_topology(mesh, js.Interpolating(), 1)
+    rng = np.random.default_rng(0)
+    flat = rng.uniform(-4, 4, (400, 2))
+    chosen = []
+    for shift in (1.0, 1.2):
+        height = np.where(np.arange(400) < 200, shift + 0.5, shift - 0.5) + rng.normal(scale=0.05, size=400)
+        labels = js.Regions(np.repeat([0, 1], 200), ("upper", "lower"))
+        chosen.append(fitting.Scan(np.column_stack([flat, height]), regions=labels))
+    chosen[1] = chosen[1].rows(np.arange(10, 400))
+    match = fitting.match_regions(chosen[0], mesh)
+    found = fitting.fit_cohort(
+        js.Interpolating(), topology, mesh.control(), chosen, priors=PRIORS, regions=[match, match]
+    )
+    return match, found
+
+
+def test_points_are_paired_within_their_regions():
+    match, found = plates()
+    for i, scan in enumerate(found.scans):
+        result = found.result(i)
+        owner = js.control_faces_of(result.scheme, result.fit.topology, result.surface, result.control)
+        np.testing.assert_array_equal(match.faces.rows[owner[result.at.face]], scan.regions.rows)
+        assert np.median(np.abs(result.distances)) < 0.25  # of walls 1 mm apart
+        assert [one.region for one in result.report().regions] == ["upper", "lower"]
+    with pytest.raises(ValueError, match="`regions` are of 8 control faces, and the topology has"):
+        fitted(regions=match)
+
+
 def test_bad_scans_are_named(as_users_run):
     few = fitting.Scan(np.eye(3))
     with pytest.raises(fitting.ScanError, match=r"^scan 1: the scan has 3 points for 12"):
@@ -212,6 +325,31 @@ def test_bad_scans_are_named(as_users_run):
         fitted(())
     with pytest.raises(ValueError, match="2 scans and 1 controls"):
         fitting.fit_cohort(js.Interpolating(), scans.problem().topology, [start()], subjects()[:2])
+
+
+def test_landmarks_and_shapes_are_written(tmp_path):
+    template = js.ControlMesh(start().vertices, scans.problem().mesh.faces)
+    places = {"top": np.asarray(start().vertices)[0], "side": np.asarray(start().vertices)[3]}
+    carried = fitting.carry_to_cohort(template, cohort(), places)
+    for i, own in enumerate(carried):
+        np.testing.assert_allclose(own.points, np.asarray(cohort().control.vertices)[i, [0, 3]], atol=1e-6)
+        assert all(0 < deviation < 10 for deviation in own.deviations.values())
+    modes = fitting.shape_modes(cohort().surfaces.vertices)
+    quality = fitting.measure_modes(cohort().surfaces.vertices)
+    fitting.write_shapes(tmp_path, cohort(), modes, quality=quality, landmarks=carried)
+    with np.load(tmp_path / "shapes.npz") as arrays:
+        np.testing.assert_array_equal(arrays["scores"], modes.scores)
+        np.testing.assert_array_equal(arrays["landmarks"][2], carried[2].points)
+    rows = (tmp_path / "scores.csv").read_text().splitlines()
+    assert rows[0] == "name,converged,centroid_size_mm,mode_1,mode_2" and rows[2].startswith("1,1,")
+    assert len((tmp_path / "modes.csv").read_text().splitlines()) == 3
+    assert len((tmp_path / "landmarks.csv").read_text().splitlines()) == 7
+    mean = js.read_mesh(tmp_path / "mean.vtp")
+    np.testing.assert_array_equal(mean.vertices, modes.mean)
+    place = json.loads((tmp_path / "2.mrk.json").read_text())["markups"][0]["controlPoints"][0]["position"]
+    np.testing.assert_allclose(place, carried[2].points[0])
+    with pytest.raises(ValueError, match="the modes are of 3 shapes of 5 vertices"):
+        fitting.write_shapes(tmp_path, cohort(), fitting.shape_modes(np.random.default_rng(0).normal(size=(3, 5, 3))))
 
 
 # ------------------------------------------------------------------------------------------------------------- modes

@@ -9,6 +9,7 @@ from pathlib import Path
 import meshes
 import numpy as np
 import pytest
+from optimistix import RESULTS
 from scans import N_POINTS, noise, problem
 from scipy.spatial import ConvexHull, KDTree
 from trimesh import Trimesh
@@ -19,7 +20,7 @@ from fitting import Scan
 from fitting.__main__ import main
 from fitting.finding import Finding, Origin, Pose
 from fitting.report.evidence import Evidence, find_two_walls, gather_evidence, own_noise
-from fitting.report.findings import CHECKS, check_jumps, check_noise
+from fitting.report.findings import CHECKS, check_jumps, check_noise, check_rest
 from fitting.report.record import Fit
 from fitting.start.align import mirror_image, sample_faces
 
@@ -137,6 +138,15 @@ def test_noise_above_the_scans_own():
     assert check_noise(wrong._replace(noise=0.06 * seen.edge)) is None  # detail that the control mesh is too coarse for
 
 
+def test_a_surface_that_rests_where_it_started():
+    seen = evidence(good())
+    far = seen._replace(noise=10 * seen.edge, fit=sweeps(seen.fit, [9, 8.9, 8.9]))
+    assert check_rest(far).name == "rests_where_it_started"
+    assert check_rest(far._replace(fit=sweeps(seen.fit, [19, 8.9, 8.9]))) is None  # it was moved
+    assert check_rest(far._replace(noise=0.06 * seen.edge)) is None  # it is not far off
+    assert check_rest(far._replace(fit=dataclasses.replace(far.fit, result=RESULTS.nonfinite))) is None  # nor at rest
+
+
 def test_own_noise_is_that_of_points_about_their_planes():
     rng = np.random.default_rng(0)
     flat = np.append(rng.uniform(0, 100, (5000, 2)), rng.normal(scale=0.3, size=(5000, 1)), axis=1)
@@ -150,7 +160,7 @@ def test_own_noise_is_that_of_points_about_their_planes():
 
 
 def test_every_check_is_told_once():
-    assert len({check.__name__ for check in CHECKS}) == len(CHECKS) == 7
+    assert len({check.__name__ for check in CHECKS}) == len(CHECKS) == 8
 
 
 # ------------------------------------------------------------------------------------------------ how the fit began

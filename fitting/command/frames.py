@@ -21,7 +21,7 @@ _FRAMES = "frames"
 _REFUSALS = (js.MeshError, ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError)
 # Options that a series has no use for, and their values where they are not given.
 _UNUSED = {"tolerance": None, "points": None, "boundary": None, "landmarks": None, "carry": None, "mirror": False}
-_UNUSED |= {"resume": False, "symmetry": None}
+_UNUSED |= {"resume": False, "symmetry": None, "prior": None, "template_out": None}
 
 
 def fit_frames(scans: list[Source], options: argparse.Namespace, recipe: Recipe) -> int:
@@ -30,7 +30,7 @@ def fit_frames(scans: list[Source], options: argparse.Namespace, recipe: Recipe)
     try:
         for name, usual in _UNUSED.items():
             if getattr(options, name) != usual:
-                raise ValueError(f"--{name} is not of a series: leave it out.")
+                raise ValueError(f"--{name.replace('_', '-')} is not of a series: leave it out.")
         with working_in(folder):
             return _fit_and_save(scans, folder, options, recipe)
     except _REFUSALS as error:

@@ -16,7 +16,7 @@ from ..image.volume import Label
 from ..model.priors.boundary import BoundaryCurve, boundary_of
 from ..run.checkpoint import marks_of
 from ..run.names import find_scans
-from ..run.recipe import Recipe
+from ..run.recipe import Recipe, find_fits, load
 from ..scan.example import example
 from ..scan.landmarks import FramedLandmarks, Landmarks, match_landmarks, read_framed_landmarks, read_landmarks
 from ..scan.regions import Groups, match_regions, read_groups
@@ -126,7 +126,7 @@ def _read_template(
 ) -> tuple[js.ControlMesh | None, Frame | None]:
     """The template in the frame of the scan where both files say theirs, and the frame that it is in."""
     if options.control is None:
-        return None, None
+        return (None, None) if options.prior is None else (_mean_of_family(Path(options.prior), recipe), of_scan)
     mesh, own = js.read_mesh(options.control, scale=options.control_scale), js.read_frame(options.control)
     if own is None:  # a template that stays where it is lies in the frame of the scan
         return mesh, of_scan if recipe.pose is None else None
@@ -136,6 +136,13 @@ def _read_template(
     normals = None if mesh.normals is None else in_frame(mesh.normals, own, of_scan)
     turned = in_frame(mesh.vertices, own, of_scan)
     return js.ControlMesh(turned, mesh.faces, normals, regions=mesh.regions), of_scan
+
+
+def _mean_of_family(folder: Path, recipe: Recipe) -> js.ControlMesh:
+    """The mean of the fits in a folder, as a template."""
+    one, shape = load(folder / find_fits(folder)[0]).control_mesh, recipe.priors.shape
+    assert shape is not None
+    return js.ControlMesh(np.asarray(shape.mean, np.float64), one.faces, regions=one.regions)
 
 
 def suggest_for_image(recipe: Recipe, scan: Scan, options: argparse.Namespace) -> Recipe:

@@ -15,6 +15,7 @@ from .messages import report_failure
 from .one import fit_one
 from .options import check_options, make_parser, make_recipe
 from .programs import keep_compiled_programs
+from .template import make_template_of_all
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -26,8 +27,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(arguments: Sequence[str] | None) -> int:
     parser = make_parser()
     options = parser.parse_args(arguments)
-    if options.control and not options.scans:
-        parser.error("a control mesh needs a scan to be fitted to: give SCAN to --control")
+    if (options.control or options.prior) and not options.scans:
+        which = "--control" if options.control else "--prior"
+        parser.error(f"a control mesh needs a scan to be fitted to: give SCAN to {which}")
     if options.labels and not options.scans:
         parser.error("labels are those of a scan: give SCAN before --labels, which takes all the words that follow")
     if options.carry and not options.control:
@@ -36,6 +38,8 @@ def _main(arguments: Sequence[str] | None) -> int:
         parser.error("--periodic and --valves are of frames: give --series")
     if options.series and not options.control:
         parser.error("--series fits a template to all frames: give --control MESH")
+    if options.template_out and (options.control or options.prior or not options.scans):
+        parser.error("--template-out makes a template of scans: give scans, and neither --control nor --prior")
     keep_compiled_programs()
     try:
         check_options(options)
@@ -46,6 +50,8 @@ def _main(arguments: Sequence[str] | None) -> int:
     try:
         if options.series:
             return fit_frames(scans, options, recipe)
+        if options.template_out:
+            return make_template_of_all(scans, options, recipe)
         if len(scans) > 1:
             return fit_all(scans, options, recipe)
         scan = scans[0] if scans else None

@@ -24,7 +24,7 @@ from .outputs import save_outputs
 from .progress import Progress
 
 # What a scan, a file or a fit may be refused by, each with words of its own.
-_REFUSALS = (js.MeshError, ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError)
+REFUSALS = (js.MeshError, ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError)
 
 
 def fit_one(scan: Source | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str) -> dict:
@@ -33,7 +33,7 @@ def fit_one(scan: Source | None, folder: Path, options: argparse.Namespace, reci
     try:
         with working_in(folder):
             return _fit_and_save(scan, folder, options, recipe, title)
-    except _REFUSALS as error:
+    except REFUSALS as error:
         status = report_failure(error)
     except (Exception, SystemExit) as error:  # a fault of this software or another: it must not end the other fits
         traceback.print_exc()

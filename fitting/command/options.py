@@ -14,7 +14,7 @@ from jaxsubdiv import SCHEMES
 
 from ..model.limits import check_numbers
 from ..run.folder import CARRIED, LANDMARKS
-from ..run.recipe import Recipe, load_recipe
+from ..run.recipe import Recipe, load_cohort, load_recipe
 from ..run.surface_files import FORMATS
 from ..scan.example import Example
 from ..start.parts import PartKind
@@ -46,6 +46,18 @@ def make_parser() -> argparse.ArgumentParser:
         help="points, meshes, label maps or images, or folders of them: .ply .xyz .csv .vtp .nii.gz .nrrd",
     )
     add("--control", metavar="MESH", help="template of triangles and quads to start from; default: made from the scan")
+    add(
+        "--template-out",
+        metavar="MESH",
+        help="make one template of all scans, which the first has no more part in than the others, and write it; with "
+        "--symmetry it has a mirror plane; OUT, where it is given, gets the fits",
+    )
+    add(
+        "--prior",
+        metavar="FITS",
+        help="folder of the fits of a family: what the scan lacks is filled as the family varies; without --control, "
+        "their mean is the template",
+    )
     add("-o", "--output", metavar="OUT", help="folder for the results (default: fit_ and the scan's file, or fits)")
     add("--faces", type=int, help=f"of the control mesh, where it is made (default: {Recipe.faces})")
     add("--kind", choices=("triangle", "quad"), help=f"of these faces (default: {Recipe.kind})")
@@ -157,6 +169,8 @@ def make_recipe(options: argparse.Namespace) -> Recipe:
     if options.mirror:
         given["mirror"] = True
     asked = {name: getattr(options, name) for name in ("symmetry", "likeness") if getattr(options, name) is not None}
+    if options.prior is not None:
+        asked["shape"] = load_cohort(options.prior)
     if asked:
         given["priors"] = dataclasses.replace(recipe.priors, **asked)
     return dataclasses.replace(recipe, scheme=scheme, **given)

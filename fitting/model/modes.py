@@ -27,6 +27,9 @@ class Modes(NamedTuple):
     """Part of the variance that each mode has."""
     aligned: Float[np.ndarray, "s v 3"]
     """The shapes, moved onto the mean."""
+    sizes: Float[np.ndarray, "s"]
+    """Centroid size of each shape as it was given, in mm: the root of the summed squares of the distances of its
+    vertices from their mean."""
 
     def shape(self, scores: Sequence[float] | Float[np.ndarray, "j"]) -> Float[np.ndarray, "v 3"]:
         """The shape at these scores, in standard deviations along the first modes."""
@@ -52,7 +55,8 @@ def shape_modes(vertices: ArrayLike, *, size: bool = False) -> Modes:
     if x.ndim != 3 or x.shape[0] < 2 or x.shape[2] != 3 or not np.isfinite(x).all():
         raise ValueError(f"modes need finite vertices [s, v, 3] of two shapes or more; got {list(x.shape)}.")
     x = x - x.mean(axis=1, keepdims=True)
-    usual, mean = float(np.mean(np.linalg.norm(x, axis=(1, 2)))), x[0]
+    sizes, mean = np.linalg.norm(x, axis=(1, 2)), x[0]
+    usual = float(np.mean(sizes))
     for _ in range(_STEPS):
         mean = mean * (usual / np.linalg.norm(mean))  # averaging, and scaling by parts, would shrink it to nothing
         x = np.stack([align_shape(one, mean, scale=size) for one in x])
@@ -69,4 +73,5 @@ def shape_modes(vertices: ArrayLike, *, size: bool = False) -> Modes:
         scores=left * np.sqrt(n - 1),
         share=widths**2 / max(np.sum(widths**2), np.finfo(float).tiny),
         aligned=x,
+        sizes=sizes,
     )

@@ -8,6 +8,7 @@ from scipy.spatial import KDTree
 
 import jaxsubdiv as js
 
+from ..model.pairing import Scene
 from ..scan.closest_points import nearest_rows
 from ..scan.outliers import first_of_each
 from ..start.cloud import on_lines, rows_on_surfaces
@@ -23,6 +24,9 @@ _LEAST_PATCHED = 400
 # The kurtosis is 3 for one Gaussian wall, 1.8 for one that is evenly thick, and falls to 1 for two walls: 1.6 is that
 # of walls 4.6 standard deviations apart.
 _TWO_HUMPS = 1.6
+# Each limit lies between the fits that are wrong and those that are right of tests/bench/fit_trust.py.
+NOISE_OVER_OWN, NOISE_OVER_EDGE = 3.0, 0.12
+_HARDLY_FELL = 0.8  # of the distances at the start
 
 
 class OwnNoise(NamedTuple):
@@ -115,12 +119,31 @@ class Evidence(NamedTuple):
     """Vertices that the scan covers."""
 
 
+def rests_far_off(scene: Scene, noise: float, edge: float, robust_rms: Float[np.ndarray, "sweeps"]) -> bool:
+    """Whether a surface that came to rest did so far from the scan, hardly nearer than it started.
+
+    Args:
+        scene: the scan.
+        noise: of the distances at the end, in mm.
+        edge: length of a control edge in mm.
+        robust_rms: at the start and after every sweep, in mm.
+    """
+    if noise < NOISE_OVER_EDGE * edge or robust_rms[-1] < _HARDLY_FELL * robust_rms[0]:
+        return False
+    own = own_noise(np.asarray(scene.scan.points, np.float64), _counted(scene)).noise
+    return not noise < NOISE_OVER_OWN * own  # of points along lines nothing is known, and nothing explains it
+
+
+def _counted(scene: Scene) -> Bool[np.ndarray, "p"]:
+    """Points that have a weight, and are not scattered."""
+    return (np.asarray(scene.scan.weights_or_ones()) > 0) & ~np.asarray(scene.around.scattered)
+
+
 def gather_evidence(
     fit: Fit, surface: js.RefinedSurface, areas: Float[np.ndarray, "v"], covered: Bool[np.ndarray, "v"]
 ) -> Evidence:
     """All that the checks look at."""
-    look, scattered = fit.look, np.asarray(fit.scene.around.scattered)
-    counted = (np.asarray(fit.scene.scan.weights_or_ones()) > 0) & ~scattered
+    look, counted = fit.look, _counted(fit.scene)
     return Evidence(
         fit=fit,
         surface=surface,

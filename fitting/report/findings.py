@@ -8,10 +8,9 @@ from jaxtyping import Float
 
 from ..finding import Finding
 from .coverage import unit
-from .evidence import Evidence, among_their_own, find_two_walls
+from .evidence import NOISE_OVER_EDGE, NOISE_OVER_OWN, Evidence, among_their_own, find_two_walls, rests_far_off
 
 # Each limit lies between the fits that are wrong and those that are right of tests/bench/fit_trust.py.
-_NOISE_OVER_OWN, _NOISE_OVER_EDGE = 3.0, 0.12
 _UNEXPLAINED_FAR, _FAR, _UNEXPLAINED = 0.03, 0.1, 0.08  # far: in control edges
 _UNSUPPORTED = 0.5
 _TWO_WALLS, _ROUNDING = 0.15, 1e-4  # of a control edge
@@ -27,8 +26,8 @@ def find_what_speaks_against(seen: Evidence) -> list[Finding]:
 
 def check_convergence(seen: Evidence) -> Finding | None:
     """Whether the surface came to rest."""
-    if seen.fit.result == optx.RESULTS.successful:
-        return None
+    if any(seen.fit.result == end for end in (optx.RESULTS.successful, optx.RESULTS.nonlinear_divergence)):
+        return None  # of the latter `check_rest` tells
     return Finding(
         "not_converged",
         f"the fit did not converge in {len(seen.fit.rms) - 1} sweeps: the surface is where it stopped. Give more "
@@ -37,10 +36,27 @@ def check_convergence(seen: Evidence) -> Finding | None:
     )
 
 
+def check_rest(seen: Evidence) -> Finding | None:
+    """Whether a surface at rest was moved to the scan at all."""
+    fit = seen.fit
+    unmoved = optx.RESULTS.successful, optx.RESULTS.nonlinear_divergence
+    if not any(fit.result == end for end in unmoved):
+        return None
+    if not rests_far_off(fit.scene, seen.noise, seen.edge, fit.robust_rms):
+        return None
+    return Finding(
+        "rests_where_it_started",
+        f"the surface came to rest {seen.noise:.3g} mm from the scan, hardly nearer than it started: the priors hold "
+        "it there, or the start is off. Give softer priors, a template that was not fitted to another scan, or a "
+        "better start.",
+        {"noise": seen.noise, "start": float(fit.robust_rms[0]), "end": float(fit.robust_rms[-1])},
+    )
+
+
 def check_noise(seen: Evidence) -> Finding | None:
     """Whether the distances are noise of the scan, or a surface that is wrong."""
     over_own, over_edge = seen.noise / max(seen.own.noise, 1e-9 * seen.edge), seen.noise / seen.edge
-    if np.isnan(over_own) or over_own < _NOISE_OVER_OWN or over_edge < _NOISE_OVER_EDGE:
+    if np.isnan(over_own) or over_own < NOISE_OVER_OWN or over_edge < NOISE_OVER_EDGE:
         return None
     return Finding(
         "noise_above_the_scans_own",
@@ -142,6 +158,7 @@ def _place(at: Float[np.ndarray, "3"]) -> str:
 
 CHECKS: tuple[Callable[[Evidence], Finding | None], ...] = (
     check_convergence,
+    check_rest,
     check_noise,
     check_unexplained_points,
     check_unsupported_surface,

@@ -276,4 +276,6 @@ def _words(result: optx.RESULTS) -> str:
     """Why the fit stopped, in words; optimistix's own where they are not about its inner steps."""
     if result == optx.RESULTS.nonlinear_max_steps_reached:
         return "max_sweeps reached before the distances came to rest"
+    if result == optx.RESULTS.nonlinear_divergence:
+        return "at rest where it started, far from the scan"
     return str(optx.RESULTS[result])

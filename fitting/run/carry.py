@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 import jaxsubdiv as js
 from jaxsubdiv.notices import warn
 
+from ..report.cohort import Cohort
 from ..report.coverage import unit
 from ..report.result import FitResult
 from ..scan.closest_points import closest_points
@@ -105,6 +106,25 @@ def carry_landmarks(
     across = normals[:, :, None] * normals[:, None, :]
     covariances = result.posterior.covariances(at) + misfit[:, None, None] * across
     return CarriedLandmarks(names, points, covariances, offsets, at)
+
+
+def carry_to_cohort(
+    template: js.ControlMesh, cohort: Cohort, landmarks: Mapping[str, ArrayLike]
+) -> tuple[CarriedLandmarks, ...]:
+    """A template's landmarks on every surface of a cohort, as `carry_landmarks` puts them there.
+
+    The rows of all belong together: `np.stack([one.points for one in carried])` has the shape `[s, l, 3]` that
+    `shape_modes`, `compare_groups` and `measure_modes` take.
+
+    Args:
+        template: where the fits of the cohort started, before any alignment.
+        cohort: the fits.
+        landmarks: positions on the template by name.
+
+    Raises:
+        ScanError: as `carry_landmarks` does.
+    """
+    return tuple(carry_landmarks(template, cohort.result(i), landmarks) for i in range(len(cohort)))
 
 
 class _Stand(NamedTuple):

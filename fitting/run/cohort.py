@@ -14,33 +14,34 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax import lax
-from jaxtyping import Array
 
 import jaxsubdiv as js
 from jaxsubdiv.errors import name_rows
 from jaxsubdiv.notices import warn
 
 from ..model.limits import check_numbers
-from ..model.pairing import Scene, make_scene
+from ..model.pairing import Look, Scene, make_scene
 from ..model.priors import Priors
 from ..model.priors.boundary import BoundaryCurve
-from ..model.priors.landmarks import Anchors
-from ..model.priors.shifts import SlicePlanes
 from ..model.priors.symmetry import Symmetry
 from ..model.recipe import Settings
 from ..model.residual import Model, analyse
 from ..model.robust import AbstractLoss, geman_mcclure
 from ..model.unknowns import Free, Variables
-from ..report.cohort import Cohort
-from ..report.record import Fit, look_at
+from ..report.cohort import Cohort, name_subjects
+from ..report.evidence import rests_far_off
+from ..report.record import Fit, choose_faces
 from ..report.result import FitResult
 from ..scan.landmarks import Landmarks
+from ..scan.regions import RegionMatch
 from ..scan.scan import Scan, ScanError
 from ..solve.conjugate_gradients import ConjugateGradients
 from ..solve.strengths import FromTargets
 from ..solve.sweeps import CONVERGED, NONFINITE, State, Subject, Sweeps, loose_damping, subject_residual
 from ..start.folds import Folds
-from .fit import check, find_partners, fit, gather_inputs, record_fit, sound_start
+from .fit import check, check_regions, find_partners, gather_inputs, record_fit, sound_start
+from .pilot import make_pilot
+from .stack import fill_choices, fill_scene, fill_up, split_common
 
 # Of the gradient, squared sums: tighter solves of a sweep, whose pairs change anyway, take longer in all.
 _SOLVED, _MOST_STEPS = 0.03, 200
@@ -61,6 +62,8 @@ def fit_cohort(
     landmark_deviation: float = 1.0,
     symmetry: Symmetry | None = None,
     boundary: BoundaryCurve | Sequence[BoundaryCurve] | None = None,
+    regions: RegionMatch | Sequence[RegionMatch | None] | None = None,
+    names: Sequence[str] | None = None,
     loss: AbstractLoss | None = None,
     max_sweeps: int = 60,
     tolerance: float = 0.1,
@@ -74,25 +77,27 @@ def fit_cohort(
     Args:
         scheme, topology: as in `fit`.
         controls: where the fits start: one control for all, or one a scan, aligned with it (see `align`).
-        scans: in mm. They may differ in length; all have normals, or none. Points are paired with any face, whatever
-            their regions.
+        scans: in mm. They may differ in length; all have normals, or none.
         free, loss, max_sweeps, tolerance: as in `fit`.
         priors: as in `fit`; strengths that `fit` would find from the scan are those of the pilot, place by place: with
             `bend=None`, the default, the smoothness; with `likeness=None` how much of each control mesh's own shape is
             expected of it; and how far shapes may be from their modes.
-        pilot: an ordinary fit of the same control mesh; default, where it is needed: that of the first scan.
-        landmarks, boundary: as in `fit`, one a scan; or one for all.
+        pilot: an ordinary fit of the same control mesh; default, where it is needed: that of the first scan. One whose
+            start was fitted to its own scan is replaced.
+        landmarks, boundary, regions: as in `fit`, one a scan; or one for all.
+        names: of the scans, for tables and folders; default: their numbers.
         landmark_deviation, symmetry: as in `fit`, for all; symmetry is by default that of the first control mesh.
         at_once: how many subjects share each operation, as the memory allows: on an accelerator many; on a CPU one at
             a time is as fast, and stops when it has converged.
 
     Warns:
-        UserWarning: some fits did not converge; it names them, and `Cohort.converged` has them. Or faces of a control
-            mesh lie upside down, see `fit`.
+        UserWarning: some fits did not converge; it names them, and `Cohort.converged` has them. Or the control mesh was
+            fitted to the pilot's own scan, so that the pilot is replaced. Or faces of a control mesh lie upside down,
+            see `fit`.
 
     Raises:
         ScanError: a scan cannot be fitted; the text names it by its number. Or some have normals and others none.
-        ValueError: as in `fit`; or the numbers of scans, controls, landmarks and boundaries differ.
+        ValueError: as in `fit`; or the numbers of scans, controls, landmarks, boundaries and regions differ.
     """
     check_numbers({"max_sweeps": max_sweeps, "tolerance": tolerance, "landmark_deviation": landmark_deviation})
     check_numbers({"at_once": at_once})
@@ -112,37 +117,45 @@ def fit_cohort(
         if id(control) not in sound:
             sound[id(control)] = sound_start(scheme, topology, control, free)
     controls = [sound[id(control)] for control in controls]
+    named = name_subjects(n, names)
     places = [None] * n if landmarks is None else _one_each(landmarks, Landmarks, n, "landmarks")
     curves = [None] * n if boundary is None else _one_each(boundary, BoundaryCurve, n, "boundaries")
+    matches = [None] * n if regions is None else _one_each(regions, RegionMatch, n, "regions")
+    for match in matches:
+        check_regions(match, topology)
     partners = find_partners(symmetry, priors, topology, controls[0])
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
     settings["landmark_deviation"] = landmark_deviation
     inputs = []
-    for control, scan, place, curve in zip(controls, scans, places, curves, strict=True):
+    for control, scan, place, curve, match in zip(controls, scans, places, curves, matches, strict=True):
         own = gather_inputs(scheme, topology, control, scan, free, place, landmark_deviation, curve)
         own |= {"symmetry": partners, "alike": None if pilot is None else pilot.fit.inputs.get("alike")}
-        inputs.append(own)
+        inputs.append(own | {"regions": match})
     made = [
         analyse(scheme, topology, control, free, priors, own) for control, own in zip(controls, inputs, strict=True)
     ]
-    if pilot is None and any(one.n_strengths and one.given_strengths() is None for one in made[0][0].priors):
-        own = {"landmarks": places[0], "boundary": curves[0], "symmetry": partners}
-        pilot = fit(scheme, topology, controls[0], scans[0], throw=False, **settings, **own)
+    if pilot is not None or any(one.n_strengths and one.given_strengths() is None for one in made[0][0].priors):
+        of_each = [
+            {"landmarks": place, "boundary": curve, "symmetry": partners, "regions": match}
+            for place, curve, match in zip(places, curves, matches, strict=True)
+        ]
+        pilot = make_pilot(scheme, topology, controls, scans, of_each, settings, pilot)
     filled = [
         analyse(scheme, topology, control, free, priors, own)
-        for control, own in zip(controls, _fill_up(inputs), strict=True)
+        for control, own in zip(controls, fill_up(inputs), strict=True)
     ]
     without = () if pilot is None or priors.bend is not None or "height" in pilot.fit.strengths.values else ("height",)
     models = [_leave_out(model, without) for model, _ in made]
     size = -(-max(scan.n_points for scan in scans) // _ROUND) * _ROUND
     scenes = [
-        make_scene(scan, model.refine(y), own["slices"])
+        make_scene(scan, model.refine(y), own["slices"], choose_faces(own["regions"], model, y, scan))
         for scan, own, (model, y) in zip(scans, inputs, made, strict=True)
     ]
+    choices = fill_choices([scene.choice for scene in scenes], [scan.n_points for scan in scans])
     has_slices = any(scene.of_points is not None for scene in scenes)
     subjects = [
-        (_leave_out(model, without), _fill_scene(scene, size, has_slices), y)
-        for scene, (model, y) in zip(scenes, filled, strict=True)
+        (_leave_out(model, without), fill_scene(scene._replace(choice=choice), size, has_slices), y)
+        for scene, choice, (model, y) in zip(scenes, choices, filled, strict=True)
     ]
     subjects += subjects[-1:] * (-n % at_once)
     solver = Sweeps(
@@ -153,11 +166,12 @@ def fit_cohort(
         max_sweeps=max_sweeps,
         folds=Folds(topology),
     )
-    shared, own = _split_common(subjects)
+    shared, own = split_common(subjects)
     values, states = jax.tree.map(lambda rows: rows[:n], _run(solver, shared, own, at_once))
     surfaces = jax.vmap(lambda y: subjects[0][0].refine(y))(values)
-    status = np.asarray(states.status)
-    converged = status == CONVERGED
+    rows_of, states = jax.tree.map(np.asarray, (values, states))  # rows of JAX arrays would be one program each
+    ends = [_end_of(models[i], scenes[i], jax.tree.map(lambda rows, i=i: rows[i], states)) for i in range(n)]
+    converged = np.array([bool(end == optx.RESULTS.successful) for end in ends])
     if not converged.all():
         which = np.flatnonzero(~converged)
         warn(
@@ -167,27 +181,25 @@ def fit_cohort(
     told = Settings.of(scheme, topology, **settings)
 
     def fit_of(i: int) -> Fit:
-        y, state = jax.tree.map(lambda rows: rows[i], (values, states))
-        ends = optx.RESULTS
-        stopped = ends.nonfinite if status[i] == NONFINITE else ends.nonlinear_max_steps_reached
-        y = _cut(models[i], y)
-        look = look_at(models[i], y, scenes[i], loss)
-        state = eqx.tree_at(lambda one: (one.look, one.damping.hold), state, (look, _cut_hold(models[i], state)))
-        end = ends.successful if converged[i] else stopped
-        return record_fit(models[i], y, state, scenes[i], scans[i], controls[i], inputs[i], told, end)
+        y, state = jax.tree.map(lambda rows: rows[i], (rows_of, states))
+        y = _cut(models[i], jax.tree.map(jnp.asarray, y))
+        cut = _cut_look(state.look, scans[i].n_points), _cut_hold(models[i], state)
+        state = eqx.tree_at(lambda one: (one.look, one.damping.hold), state, cut)
+        return record_fit(models[i], y, state, scenes[i], scans[i], controls[i], inputs[i], told, ends[i])
 
     return Cohort(
         control=values.control,
         h=values.shared.get("h"),
         surfaces=js.RefinedSurface(surfaces.vertices, surfaces.normals, topology.faces),
         converged=converged,
-        sweeps=np.asarray(states.sweep) - 1,
-        rms=np.asarray(states.rms),
-        robust_rms=np.asarray(states.robust_rms),
-        noise=np.asarray(states.look.noise),
-        weights=np.asarray(states.look.weights),
+        sweeps=states.sweep - 1,
+        rms=states.rms,
+        robust_rms=states.robust_rms,
+        noise=states.look.noise,
+        weights=states.look.weights,
         scans=tuple(scans),
-        _fits=fit_of,
+        names=named,
+        _results=lambda i: FitResult(fit_of(i)),
     )
 
 
@@ -219,6 +231,15 @@ def _run(solver: Sweeps, shared: Any, own: Any, at_once: int) -> tuple[Variables
     return lax.map(one, own, batch_size=None if at_once == 1 else at_once)
 
 
+def _end_of(model: Model, scene: Scene, state: State) -> optx.RESULTS:
+    """Why a subject's fit ended. One that nothing moved from far off has come to rest, and has not converged."""
+    if state.status != CONVERGED:
+        return optx.RESULTS.nonfinite if state.status == NONFINITE else optx.RESULTS.nonlinear_max_steps_reached
+    if rests_far_off(scene, float(state.look.noise), float(model.edge), state.robust_rms[: state.sweep]):
+        return optx.RESULTS.nonlinear_divergence
+    return optx.RESULTS.successful
+
+
 def _one_each(given: _T | Sequence[_T], kind: type, n: int, name: str) -> list[_T]:
     """One for each scan."""
     values = [given] * n if isinstance(given, kind) else list(given)  # pyright: ignore[reportArgumentType]
@@ -232,90 +253,17 @@ def _leave_out(model: Model, names: tuple[str, ...]) -> Model:
     return Model(model.scheme, model.topology, kept, model.layout, model.is_free, model.template, model.edge)
 
 
-def _fill_up(inputs: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Landmarks, boundary points and slices filled up to the most of any subject, so that one program serves all."""
-    filled = [dict(own) for own in inputs]
-    for name, fill in (("landmarks", _fill_landmarks), ("boundary", _fill_curve), ("slices", _fill_planes)):
-        sizes = [0 if own[name] is None else len(own[name][0]) for own in inputs]
-        if max(sizes):
-            for own in filled:
-                fill(own, max(sizes))
-    return filled
-
-
-def _fill_landmarks(own: dict[str, Any], size: int) -> None:
-    anchors = own["landmarks"]
-    more = size - len(anchors.points)
-    filled = Anchors(*(jnp.concatenate([part, jnp.repeat(part[-1:], more, axis=0)]) for part in anchors))
-    own["landmarks"] = filled._replace(deviations=filled.deviations.at[size - more :].set(jnp.inf))
-
-
-def _fill_curve(own: dict[str, Any], size: int) -> None:
-    curve = own["boundary"]
-    more = size - len(curve.points)
-    own["boundary"] = curve._replace(points=np.concatenate([curve.points, np.repeat(curve.points[-1:], more, axis=0)]))
-    own["boundary_counts"] = np.append(np.ones(size - more), np.zeros(more))
-
-
-def _fill_planes(own: dict[str, Any], size: int) -> None:
-    planes = own["slices"] or SlicePlanes(np.zeros(0, int), np.zeros((0, 2, 3)))
-    more = size - len(planes.numbers)
-    own["slices"] = SlicePlanes(
-        np.append(planes.numbers, np.full(more, -1)), np.concatenate([planes.planes, np.zeros((more, 2, 3))])
-    )
-
-
-def _fill_scene(scene: Scene, size: int, has_slices: bool) -> Scene:
-    """A scene with its points filled up, by points of weight 0."""
-    scan, n = scene.scan, scene.scan.n_points
-
-    def fill(rows: Any, **how: Any) -> Array:
-        rows = jnp.asarray(rows)
-        return jnp.pad(rows, [(0, size - n)] + [(0, 0)] * (rows.ndim - 1), **(how or {"mode": "edge"}))
-
-    whole = Scan(
-        fill(scan.points),
-        None if scan.normals is None else fill(scan.normals),
-        fill(scan.weights_or_ones(), constant_values=0),
-        fill(scan.relative_deviations(), constant_values=1),
-    )
-    around = type(scene.around)(*(fill(rows) for rows in scene.around))
-    of_points = scene.of_points
-    if has_slices:
-        of_points = fill(np.full(n, -1, np.int32) if of_points is None else of_points, constant_values=-1)
-    strokes = scene.strokes
-    if strokes is not None:
-        strokes = strokes._replace(nearest=fill(strokes.nearest), most=jnp.asarray(strokes.most, scan.points.dtype))
-    return Scene(whole, around, strokes, of_points, jnp.asarray(scene.open_vertices))
-
-
-def _split_common(subjects: list[Any]) -> tuple[Any, Any]:
-    """What all subjects share, once; and what differs, one a row."""
-    flat = [jax.tree.flatten(subject) for subject in subjects]
-    structure = flat[0][1]
-    for _, other in flat:
-        if other != structure:
-            raise ValueError(
-                "the subjects of a cohort must have the same priors: give landmarks and so on for all or none."
-            )
-    shared, own = [], []
-    for leaves in zip(*(leaves for leaves, _ in flat), strict=True):
-        first = leaves[0]
-        same = all(leaf is first or np.array_equal(leaf, first) for leaf in leaves)
-        shared.append(first if same else None)
-        own.append(None if same else jnp.stack([jnp.asarray(leaf) for leaf in leaves]))
-    if all(leaf is None for leaf in own):  # one subject, or copies of one
-        y = structure.unflatten(range(len(shared)))[2].control.vertices
-        own[y] = jnp.stack([leaves[0][y] for leaves in flat])
-        shared[y] = None
-    return structure.unflatten(shared), structure.unflatten(own)
-
-
 def _cut(model: Model, y: Variables) -> Variables:
     """Variables without what only filled up an array."""
     sizes = {name: of.shape for name, of in model.layout.shared}
     shared = {name: value[tuple(map(slice, sizes[name]))] for name, value in y.shared.items() if name in sizes}
     return Variables(y.control, shared)
+
+
+def _cut_look(look: Look, n: int) -> Look:
+    at, pairs = (jax.tree.map(lambda rows: rows[:n], part) for part in (look.at, look.pairs))
+    of_points = {name: getattr(look, name)[:n] for name in ("distances", "weights", "precisions")}
+    return look._replace(at=at, pairs=pairs, **of_points)
 
 
 def _cut_hold(model: Model, state: State) -> Any:

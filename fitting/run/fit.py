@@ -147,11 +147,7 @@ def fit(
     if alike is not None and alike.shape != (topology.n_control_faces,):
         n_faces = topology.n_control_faces
         raise ValueError(f"`alike` must say it of each of the {n_faces} control faces; got {list(alike.shape)}.")
-    if regions is not None and len(regions.faces) != topology.n_control_faces:
-        raise ValueError(
-            f"`regions` are of {len(regions.faces)} control faces, and the topology has {topology.n_control_faces}. "
-            "Match the scan with the control mesh that the topology was made from."
-        )
+    check_regions(regions, topology)
     control = sound_start(scheme, topology, control, free)
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
     settings["landmark_deviation"] = landmark_deviation
@@ -306,6 +302,15 @@ def record_fit(
         result=result,
         origin=origin or Origin(),
     )
+
+
+def check_regions(regions: RegionMatch | None, topology: js.Topology) -> None:
+    """Refuses regions of another control mesh."""
+    if regions is not None and len(regions.faces) != topology.n_control_faces:
+        raise ValueError(
+            f"`regions` are of {len(regions.faces)} control faces, and the topology has {topology.n_control_faces}. "
+            "Match the scan with the control mesh that the topology was made from."
+        )
 
 
 def find_partners(

@@ -17,15 +17,17 @@ import jaxsubdiv as js
 from ..finding import Origin
 from ..model.limits import check_numbers
 from ..model.priors import Priors
+from ..model.priors.shape_modes import ShapeModes
 from ..model.priors.symmetry import Symmetry, find_symmetry
 from ..model.recipe import Settings
 from ..report.result import FitResult
-from ..scan.closest_points import nearest_rows
+from ..scan.closest_points import closest_points, nearest_rows
 from ..scan.landmarks import Landmarks
 from ..scan.regions import Groups, match_regions
 from ..scan.scan import Scan
 from ..start.align import Alignment, Kind, align, mirror_image, put
 from ..start.control_mesh import FaceKind, make_control_mesh
+from ..start.family import flat_surface, place_member
 from ..start.parts import PartKind
 from .checkpoint import Checkpoint
 from .fit import CHECKPOINT, check, fit
@@ -100,7 +102,9 @@ def fit_scan(
         levels: of refinement, see `Recipe`.
         faces, kind, closed, part: of the control mesh, where it is made; see `control_mesh`. Points of the scan on
             parts that are left out are not fitted.
-        pose: how the template may move to the scan before the fit, see `align`; None leaves it where it is.
+        pose: how the template may move to the scan before the fit, see `align`; None leaves it where it is. Where
+            `priors` have a shape, and the scheme interpolates, the fit then starts from the member of the family that
+            the scan shows, see `ShapeModes`.
         mirror: take the template's mirror image, which serves the other side of the body.
         landmarks: places on scan and template, for the alignment and the fit; see `Landmarks`.
         regions: where the template has groups of faces, and the scan labels: the group, or groups, that points of a
@@ -172,7 +176,11 @@ def fit_scan(
     elif pose is not None:
         say("aligns the control mesh with the scan")
         alignment = align(mesh, scan, kind=pose, landmarks=landmarks)
-        start = _Start(alignment.mesh, first, alignment, 0, Origin(alignment.pose, alignment.doubts))
+        there = alignment.mesh
+        if priors.shape is not None and first.interpolates:
+            say("looks for the member of the family that the scan shows")
+            there = _member(priors.shape, there, scan)
+        start = _Start(there, first, alignment, 0, Origin(alignment.pose, alignment.doubts))
     else:
         start = _Start(mesh, first, None, 0, Origin())
     own_partners = options.pop("symmetry", None)
@@ -241,7 +249,22 @@ def _partners(template: js.ControlMesh, scheme: js.AbstractScheme, splits: int) 
 def _landmarks_there(landmarks: Landmarks | None, mesh: js.ControlMesh | None, start: _Start) -> Landmarks | None:
     if landmarks is None or mesh is None or start.alignment is None:
         return landmarks
-    return moved(landmarks, mesh, start.alignment)
+    there = moved(landmarks, mesh, start.alignment)
+    if start.mesh is start.alignment.mesh or np.ndim(there.on_mesh) == 1:
+        return there
+    # The mesh has another shape there: on its faces landmarks keep their places.
+    before, after = (flat_surface(one.vertices, one.faces) for one in (start.alignment.mesh, start.mesh))
+    at = closest_points(before, np.asarray(there.on_mesh))
+    return there._replace(on_mesh=np.asarray(js.evaluate(after, at).points))
+
+
+def _member(shape: ShapeModes, placed: js.ControlMesh, scan: Scan) -> js.ControlMesh:
+    """The aligned template with the shape of the family's member that the scan shows; see `place_member`."""
+    if len(shape.mean) != len(placed.vertices):
+        return placed  # the fit tells what is wrong
+    mean, modes = (np.asarray(rows, np.float64) for rows in (shape.mean, shape.modes * shape.deviations[:, None, None]))
+    found = place_member(mean, modes, placed, scan)
+    return js.ControlMesh(found.vertices, placed.faces, regions=placed.regions, check=False)
 
 
 def _arrays(start: _Start) -> dict[str, Any]:

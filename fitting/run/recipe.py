@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 import os
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import jaxsubdiv as js
 
 from ..model.recipe import Settings
+from ..report.cohort import COHORT, Cohort, name_subjects
 from ..report.result import FitResult
 from ..report.saved import load_fit
 from ..scan.regions import match_regions
@@ -94,3 +96,51 @@ def load(folder: str | os.PathLike[str]) -> FitResult:
     """
     found, recipe = load_fit(folder)
     return FitResult(found, recipe=Recipe.from_json(recipe))
+
+
+def load_cohort(folder: str | os.PathLike[str]) -> Cohort:
+    """The cohort that `Cohort.save` wrote into a folder, or one of all fits in the folders of `jaxsubdiv-fit`.
+
+    The order is that of the saved cohort; of other fits, that of the names of their folders.
+
+    Args:
+        folder: with a folder of each fit in it.
+
+    Raises:
+        FileNotFoundError: there are no saved fits in the folder, or one of the cohort's is missing.
+        ValueError: a file is damaged, or the fits do not have one control mesh; see `Cohort.of`.
+    """
+    folder = Path(folder)
+    names = find_fits(folder)
+    try:
+        return Cohort.of([load(folder / name) for name in names], names)
+    except ValueError as error:
+        raise ValueError(f"{folder}: {error}") from None
+
+
+def find_fits(folder: Path) -> tuple[str, ...]:
+    """The names of the folders with fits in a cohort's folder, in the cohort's order or that of the names.
+
+    Raises:
+        FileNotFoundError: there are none.
+        ValueError: the file of the cohort is damaged.
+    """
+    names = _saved_names(folder / COHORT)
+    if names is None:
+        names = tuple(sorted(path.parent.name for path in folder.glob("*/fit.npz")))
+    if not names:
+        raise FileNotFoundError(f"{folder} has no folders with saved fits in it: it is not that of a cohort.")
+    return names
+
+
+def _saved_names(path: Path) -> tuple[str, ...] | None:
+    """The names in a saved cohort's file, in their order; None where there is no such file."""
+    if not path.is_file():
+        return None
+    try:
+        names = json.loads(path.read_text(encoding="utf-8"))["names"]
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ValueError("'names' is no list of words")
+        return name_subjects(len(names), names)
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"{path}: {error}. It is not the file of a saved cohort.") from None

@@ -73,7 +73,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if theirs is not None:
             print(f"| {path.stem} | {volume:.1f} ± {deviation:.1f} | {theirs} | {volume / theirs - 1:+.1%} |")
     ejected, deviation = table.ejection[CAVITY]
-    print(f"\nEjection fraction {ejected:.3f} ± {deviation:.3f}; biv-me {BIV_ME_EJECTION}")
+    print(f"\nEjection fraction, of the largest and smallest volume: {ejected:.3f} ± {deviation:.3f}")
+    own = {path.stem: volume for path, volume in zip(paths, volumes, strict=True)}
+    if {"frame_00", "frame_08"} <= set(own):
+        print(f"Of frames 0 and 8: {1 - own['frame_08'] / own['frame_00']:.3f}; biv-me {BIV_ME_EJECTION}")
     mass = table.column("wall mass")[0]
     print(f"Mass of the wall {mass.mean():.0f} g, from {mass.min():.0f} to {mass.max():.0f} g over the beat")
     print(f"Shifts of the slices, mm: {np.round(np.linalg.norm(found.shifts, axis=1), 1).tolist()}")

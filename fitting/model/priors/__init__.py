@@ -66,9 +66,9 @@ class Priors(eqx.Module):
             about 0 where its details say nothing of the scan's; and 0 where `bend` is given. Give 0 where the control
             mesh was made from this very scan or fitted to it before, for its noise would be expected again. With `bend`
             given, nothing is expected of curvature.
-        shape: the family that the control mesh is one of, as `shape_modes` found it over control meshes that correspond
-            to this one (`Modes`), or a `ShapeModes`: where the scan lacks something, it is filled by scores along the
-            modes that the rest of the scan shows. Default: left out.
+        shape: the family that the control mesh is one of: a `Cohort` whose control meshes correspond to this one, their
+            `Modes` as `shape_modes` finds them, or a `ShapeModes`. Where the scan lacks something, it is filled by
+            scores along the modes that the rest of the scan shows. Default: left out.
         shift: of how far breathing displaced a slice of the scan, in mm, along each of two axes of the slice's plane.
         frame_change: of how far a control vertex moves from one frame of a series to the next, in mm, in each
             coordinate; see `fit_series`. None, the default: found from the scans.

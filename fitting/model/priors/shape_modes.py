@@ -1,7 +1,7 @@
 """Shapes seen before: the control mesh is a mean shape, moved along modes of variation, and something of its own."""
 
 import dataclasses
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,24 +11,33 @@ from jaxtyping import Array, Float, Int
 import jaxsubdiv as js
 from jaxsubdiv.linalg import cross
 
-from ..modes import Modes
+from ..modes import Modes, shape_modes
 from ..procrustes import align_shape
 from ..unknowns import AnyArray, Shared
 from .base import AbstractVertexPrior, Place, Start, backend
 
 _FIRST = 0.1  # of a control edge: standard deviation of what the modes leave, in the first sweep
+_STEPS, _MOST_SCORE = 10, 3.0  # of the scores where a fit starts
 _LEAST = 0.05  # of the widest mode: the rest of a family that has no more modes than it shows
 
 
+@runtime_checkable
+class Family(Protocol):
+    """Fits of one control mesh, as a `Cohort` is."""
+
+    control: js.Control
+    """Vertices and normals `[s, v, 3]`."""
+
+
 class ShapeModes(eqx.Module):
-    """The control meshes of a family: `Priors(shape=...)` takes one, or the `Modes` that `shape_modes` found.
+    """The control meshes of a family: `Priors(shape=...)` takes one, or a `Cohort`, or the `Modes` of `shape_modes`.
 
     Attributes:
         mean: mean control vertices in mm.
         modes: directions of variation, each of length 1 over all coordinates.
         deviations: standard deviation of the family along each, in mm over all coordinates.
         rest: standard deviation in mm, in each coordinate of a control vertex, of what a member has beside the modes.
-            Of `Modes`: what each member of the family has beside the modes of the others. None, the default: found from
+            Of a cohort or `Modes`: what each member has beside the modes of the others. None, the default: found from
             the scan, which often says too little of it and leaves the scores little to say.
     """
 
@@ -51,14 +60,33 @@ class ShapeModes(eqx.Module):
             raise ValueError(f"the standard deviation of the rest must be positive; got {self.rest}.")
 
     @staticmethod
-    def of(value: "ShapeModes | Modes | None") -> "ShapeModes | None":
-        """From what `shape_modes` found: those modes that the family varies along, and as the rest what each member has
-        beside the modes of the others."""
+    def of(value: "ShapeModes | Modes | Family | None") -> "ShapeModes | None":
+        """From the control meshes of a cohort, or from their modes: those that the family varies along, and as the rest
+        what each member has beside the modes of the others."""
+        if isinstance(value, Family):
+            value = shape_modes(value.control.vertices)
         if not isinstance(value, Modes):
             return value
         some = value.deviations > 1e-6 * value.deviations.max()
         rest = max(_beside_others(value.aligned), _LEAST * float(np.max(value.deviations)) / len(value.mean) ** 0.5)
         return ShapeModes(value.mean, value.modes[some], value.deviations[some], rest)
+
+
+def find_scores(mean: AnyArray, modes: AnyArray, vertices: AnyArray) -> Float[np.ndarray, "k"]:
+    """The scores, in standard deviations, of the member of a family that lies nearest to control vertices, whatever
+    their pose; none beyond three.
+
+    Args:
+        mean: `[v, 3]` in mm.
+        modes: `[k, v, 3]`, by how much one standard deviation along each moves the vertices, in mm.
+        vertices: `[v, 3]` in mm.
+    """
+    mean, modes, vertices = (np.asarray(rows, np.float64) for rows in (mean, modes, vertices))
+    flat, scores = modes.reshape(len(modes), -1), np.zeros(len(modes))
+    for _ in range(_STEPS):
+        away = align_shape(vertices, mean + np.tensordot(scores, modes, 1), scale=False) - mean
+        scores = np.clip(np.linalg.lstsq(flat.T, away.ravel(), rcond=None)[0], -_MOST_SCORE, _MOST_SCORE)
+    return scores
 
 
 def _beside_others(shapes: Float[np.ndarray, "s v 3"]) -> float:
@@ -94,6 +122,7 @@ class ShapePrior(AbstractVertexPrior):
     Attributes:
         mean: in mm.
         modes: displacements in mm at a score of 1.
+        first: scores where the fit starts.
         rest: standard deviation in mm of what the modes leave, or None where it is found from the scan.
     """
 
@@ -101,6 +130,7 @@ class ShapePrior(AbstractVertexPrior):
     uses: ClassVar[tuple[str, ...]] = ("scores", "pose")
     mean: Float[Array, "v 3"]
     modes: Float[Array, "k v 3"]
+    first: Float[Array, "k"]
     rest: Float[Array, ""] | None
     widest: float = eqx.field(static=True)
     """How far the widest mode moves a vertex, root mean square, in control edges."""
@@ -120,8 +150,9 @@ class ShapePrior(AbstractVertexPrior):
         edge = float(js.edge_length(start.topology, start.control.vertices))
         widest = float(shape.deviations.max()) / len(shape.mean) ** 0.5
         dtype = start.control.vertices.dtype
-        modes = (shape.modes * shape.deviations[:, None, None]).astype(dtype)
-        return cls(shape.mean.astype(dtype), modes, shape.rest, widest / edge, edge)
+        modes = shape.modes * shape.deviations[:, None, None]
+        first = jnp.asarray(find_scores(shape.mean, modes, start.control.vertices), dtype)
+        return cls(shape.mean.astype(dtype), modes.astype(dtype), first, shape.rest, widest / edge, edge)
 
     def bare(self) -> "ShapePrior":
         return dataclasses.replace(self, rest=None)
@@ -144,7 +175,7 @@ class ShapePrior(AbstractVertexPrior):
         return {"scores": Shared((len(self.modes),), lever=self.widest), "pose": Shared((6,), lasting=False)}
 
     def initial(self) -> dict[str, Array]:
-        return {"scores": jnp.zeros(len(self.modes), self.mean.dtype)}
+        return {"scores": self.first}
 
     def hold(self, place: Place, strengths: dict[str, Any]) -> _Held:
         vertices, scores = place.control.vertices, place.shared["scores"].astype(self.mean.dtype)

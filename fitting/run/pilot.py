@@ -1,0 +1,81 @@
+"""The pilot of a cohort: one ordinary fit, whose strengths of the priors hold for all subjects."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+import jaxsubdiv as js
+from jaxsubdiv.notices import warn
+
+from ..report.result import FitResult
+from ..scan.closest_points import closest_points
+from ..scan.scan import Scan
+from .fit import fit
+
+# A start that is the fit of the pilot's own scan is expected to return bit by bit, noise included: the scan is found
+# to be as like the start as can be, and the deviations that are left are those of the sweeps, not of anatomy. A start
+# may have had another h, so that its distances fall a little.
+_LIKE, _HARDLY_FELL, _NOTHING_LEFT = 0.5, 3.0, 0.003  # the last in control edges
+
+
+def make_pilot(
+    scheme: js.AbstractScheme,
+    topology: js.Topology,
+    controls: Sequence[js.Control],
+    scans: Sequence[Scan],
+    of_each: Sequence[dict[str, Any]],
+    settings: dict[str, Any],
+    given: FitResult | None = None,
+) -> FitResult:
+    """An ordinary fit of one subject, to take the strengths of the priors from.
+
+    It is the given one, or that of the first scan. Where the start is that subject's own fit, the strengths would say
+    that nothing varies: then the scan that lies farthest from its start is fitted instead, and if there is no other,
+    the same one without expecting the shape of the start.
+
+    Args:
+        of_each: landmarks, boundary, symmetry and regions of each scan, as `fit` takes them.
+        settings: what else `fit` takes.
+        given: the pilot to use, if it is of use.
+
+    Warns:
+        UserWarning: the start was fitted to the pilot's own scan.
+    """
+
+    def fit_one(i: int, **other: Any) -> FitResult:
+        return fit(scheme, topology, controls[i], scans[i], throw=False, **(settings | of_each[i] | other))
+
+    pilot = fit_one(0) if given is None else given
+    if not is_its_own_start(pilot):
+        return pilot
+    if len(scans) == 1:
+        other = fit_one(0, priors=dataclasses.replace(settings["priors"], likeness=0.0))
+        how = "nothing of the start's own shape was expected: as by Priors(likeness=0)"
+    else:
+        off = [_distance(scheme, topology, *one) for one in zip(controls, scans, strict=True)]
+        farthest = int(np.argmax(off))
+        other = fit_one(farthest)
+        how = f"that of scan {farthest} was taken instead, which lies farthest from its start"
+    warn(
+        "the control mesh was fitted to the pilot's own scan before, so that the pilot says nothing of how subjects "
+        f"differ: {how}. Start from a template or a mean, or give a pilot of another scan.",
+    )
+    return other
+
+
+def is_its_own_start(pilot: FitResult) -> bool:
+    """Whether a fit started from a surface that was fitted to the same scan, and expected that surface again."""
+    values = pilot.fit.strengths.values
+    edge = float(js.edge_length(pilot.fit.topology, pilot.control.vertices))
+    usual = float(np.median(np.asarray(values["bend"], np.float64))) ** -0.5
+    expected = float(values["likeness"]) > _LIKE and usual < _NOTHING_LEFT * edge
+    return expected and bool(pilot.robust_rms[0] < _HARDLY_FELL * pilot.robust_rms[-1])
+
+
+def _distance(scheme: js.AbstractScheme, topology: js.Topology, control: js.Control, scan: Scan) -> float:
+    """Median distance in mm of a scan's points from the surface where the fit starts."""
+    surface = js.refine(scheme, topology, control)
+    on = np.asarray(js.evaluate(surface, closest_points(surface, scan.points)).points)
+    return float(np.median(np.linalg.norm(on - np.asarray(scan.points), axis=1)))
