@@ -35,7 +35,12 @@ from ._memory_of import memory_of as memory_of
 from ._mesh import ControlMesh as ControlMesh
 from ._mesh import vector_areas as vector_areas
 from ._normals import estimate_normals as estimate_normals
+from ._padding import cut_padding as cut_padding
+from ._padding import pad_control as pad_control
+from ._padding import pad_topology as pad_topology
+from ._padding import stack_topologies as stack_topologies
 from ._refine import refine as refine
+from ._refine import refine_vertices as refine_vertices
 from ._regions import Regions as Regions
 from ._regions import as_regions as as_regions
 from ._saved_topology import load_topology as load_topology
@@ -63,6 +68,7 @@ from ._surface import corner_weights as corner_weights
 from ._surface import evaluate as evaluate
 from ._surface import sample as sample
 from ._surface import sum_corners as sum_corners
+from ._topology import Real as Real
 from ._topology import Topology as Topology
 from ._topology import build_topology as build_topology
 from .closest import FaceChoice as FaceChoice

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._control import Control
 from ._patches import patch_points
-from ._refine import refine
+from ._refine import refine, refine_vertices
 from ._scheme.base import AbstractScheme
 from ._scheme.bezier_triangle import BezierTriangle, quad_patch, triangle_patch
 from ._scheme.interpolating import edge_rule
@@ -77,7 +77,7 @@ def _evaluate(scheme: AbstractScheme, topology: Topology, control: Control, at: 
     splines, before_limit = None if topology.limit is None else topology.limit.patches, x
     if splines is not None:
         bare = eqx.tree_at(lambda topology: topology.limit, topology, None)
-        before_limit = refine(scheme, bare, control).vertices
+        before_limit = refine_vertices(scheme, bare, control)
     n_triangles = topology.control_faces[3].shape[0]
     given, uv = at.face.astype(jnp.int32), at.uv.astype(x.dtype)
     in_triangle = given < n_triangles

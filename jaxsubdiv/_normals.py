@@ -11,20 +11,20 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ._fans import Fans
-from .linalg import Rows, Vectors, cross, dot, largest, take, unit, unit_or, where
+from .linalg import PerRow, Rows, cross, dot, largest, take, unit, unit_or, where
 
 Weights: TypeAlias = Literal["area", "uniform", "angle", "sphere"]
 """How the corner normals around a vertex are weighed in (6)."""
 Boundary: TypeAlias = Literal["fan", "chord"]
 """Where the normal of a new boundary vertex comes from: the faces there are, or its edge."""
 
-Corners: TypeAlias = Float[Array, "k *rows 3"] | Vectors
-
 # A sum of cross products that is smaller than this many rounding errors of its terms has no direction of its own.
 _ROUNDING_ERRORS = 16
 
 
-def corner_sum(a: Corners, b: Corners, weights: Weights) -> tuple[Rows, Float[Array, "*rows 1"]]:
+def corner_sum(
+    a: Float[Array, "k *rows 3"], b: Float[Array, "k *rows 3"], weights: Weights
+) -> tuple[Float[Array, "*rows 3"], Float[Array, "*rows 1"]]:
     """Weighted sum of the corner normals around a vertex, eq. (6), and the size under which it is rounding alone.
 
     Args:
@@ -36,9 +36,12 @@ def corner_sum(a: Corners, b: Corners, weights: Weights) -> tuple[Rows, Float[Ar
     Source: Sisojevs & Glazs, eqs. (4)-(6), with v_i = P_i - P; "sphere": N. Max, Weights for computing vertex normals
     from facet normals, 1999.
     """
+    if weights == "sphere":
+        longest = jnp.maximum(dot(a, a), dot(b, b)).max(axis=0, keepdims=True, initial=0.0)
+        longest = jnp.broadcast_to(longest, (*a.shape[:-1], 1))
+        a, b = _inverted(a, longest), _inverted(b, longest)
     normals = _WEIGH[weights](cross(a, b), a, b)
-    total = jax.tree.map(lambda corners: corners.sum(axis=0), normals)
-    return total, _rounding(largest(normals).sum(axis=0))
+    return normals.sum(axis=0), _rounding(largest(normals).sum(axis=0))
 
 
 def ring_sum(
@@ -57,11 +60,17 @@ def ring_sum(
         there: whether a neighbour and the next make a corner of a face; default: all do.
     """
     if weights != "area":
-        a = jax.tree.map(lambda *rows: jnp.stack(rows), *(neighbour - centre for neighbour in ring))
-        b = jax.tree.map(lambda rows: jnp.roll(rows, -1, axis=0), a)
+        # Corner by corner, and no stack of them: XLA's CPU backend would branch at every element of the stack. It does
+        # so too where the edges are masked in place of the normals.
+        spokes = [neighbour - centre for neighbour in ring]
+        if weights == "sphere":
+            longest = reduce(jnp.maximum, (dot(spoke, spoke) for spoke in spokes))
+            spokes = [_inverted(spoke, longest) for spoke in spokes]
+        pairs = zip(spokes, [*spokes[1:], spokes[0]], strict=True)
+        normals = [_WEIGH[weights](cross(a, b), a, b) for a, b in pairs]
         if there is not None:  # compiled code may round two copies of one position apart, and make a corner of them
-            a, b = where(there, a, 0.0), where(there, b, 0.0)
-        return corner_sum(a, b, weights)
+            normals = [where(real, normal, 0.0) for real, normal in zip(there, normals, strict=True)]
+        return reduce(operator.add, normals), _rounding(reduce(operator.add, map(largest, normals)))
     first, rest = ring[0], ring[1:]
     # The quads (first, rest_i, rest_i+1, rest_i+2), each by its diagonals.
     across = [rest[i + 1] - first for i in range(0, len(rest) - 1, 2)]
@@ -117,42 +126,46 @@ def _rounding(terms: Array) -> Array:
     return lax.stop_gradient(_ROUNDING_ERRORS * jnp.finfo(terms.dtype).eps * terms)
 
 
-def _area(c: Corners, a: Corners, b: Corners) -> Corners:
+def _inverted(edges: Rows, longest: PerRow) -> Rows:
+    """Edges as the inversion in a sphere around their vertex leaves them: their raw cross products are those of the
+    edges over both squared lengths.
+
+    Against the longest squared edge there, so that no unit enters; a short edge is left finite. An edge that is
+    rounding alone is dropped: its inverse has a gradient of 1 / e, which says nothing.
+    """
+    longest, e = lax.stop_gradient(longest), jnp.finfo(longest.dtype).eps
+    square = dot(edges, edges)
+    there = lax.stop_gradient(square) > (_ROUNDING_ERRORS * e) ** 2 * longest
+    share = where(there, square, 1.0) / where(there, longest, 1.0)
+    return where(there, (1 / (share + e)) * edges, 0.0)
+
+
+# The weighted normal of a corner, from its cross product and its edges.
+
+
+def _area(c: Rows, a: Rows, b: Rows) -> Rows:
     return c
 
 
-def _uniform(c: Corners, a: Corners, b: Corners) -> Corners:
+def _uniform(c: Rows, a: Rows, b: Rows) -> Rows:
     return _direction(c, a, b)
 
 
-def _angle(c: Corners, a: Corners, b: Corners) -> Corners:
+def _angle(c: Rows, a: Rows, b: Rows) -> Rows:
     direction = _direction(c, a, b)
     sine, cosine = dot(c, direction), dot(a, b)
     there = sine > 0  # atan2 has no gradient at the origin, where one edge or the angle is zero
     return where(there, jnp.arctan2(where(there, sine, 1.0), cosine), 0.0) * direction
 
 
-def _sphere(c: Corners, a: Corners, b: Corners) -> Corners:
-    # Against the longest edge at this vertex, so that no unit enters; a short edge leaves a finite weight. An edge that
-    # is rounding alone drops its corners: the weight there has a gradient of 1 / e, which says nothing.
-    a2, b2 = dot(a, a), dot(b, b)
-    longest = lax.stop_gradient(jnp.maximum(a2, b2).max(axis=0, initial=0.0))
-    longest = jnp.broadcast_to(longest[None], a2.shape)
-    e = jnp.finfo(a2.dtype).eps
-    there = lax.stop_gradient(jnp.minimum(a2, b2)) > (_ROUNDING_ERRORS * e) ** 2 * longest
-    scale = where(there, longest, 1.0)
-    c, a2, b2 = where(there, c, 1.0) / scale, *(where(there, square, 1.0) / scale for square in (a2, b2))
-    return where(there, c / ((a2 + e) * (b2 + e)), 0.0)
-
-
-def _direction(c: Corners, a: Corners, b: Corners) -> Corners:
+def _direction(c: Rows, a: Rows, b: Rows) -> Rows:
     # A fused multiply-add leaves a remainder even in the cross product of a vector with itself.
     return unit_or(c, 0.0, _rounding(largest(a) * largest(b)))
 
 
-_WEIGH: dict[str, Callable[[Corners, Corners, Corners], Corners]] = {
+_WEIGH: dict[str, Callable[[Rows, Rows, Rows], Rows]] = {
     "area": _area,
     "uniform": _uniform,
     "angle": _angle,
-    "sphere": _sphere,
+    "sphere": _area,  # of inverted edges
 }

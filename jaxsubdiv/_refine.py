@@ -42,13 +42,36 @@ def refine(scheme: AbstractScheme, topology: Topology, control: Control) -> Refi
     return RefinedSurface(vertices, normals, topology.faces)
 
 
+def refine_vertices(scheme: AbstractScheme, topology: Topology, control: Control) -> Float[Array, "w 3"]:
+    """The vertices of `refine` alone: what their normals cost is saved, outside of `jax.jit` too.
+
+    Args:
+        scheme: the rules and their `h`.
+        topology: tables from `build_topology`.
+        control: vertices `[v, 3]` in any unit, and normals `[v, 3]` of any length.
+
+    Returns:
+        The refined vertices, in the unit, the dtype and the order of those of `refine`.
+
+    Raises:
+        ValueError: as `refine`.
+    """
+    _check(scheme, topology, control)
+    return _refine_vertices(scheme, topology, control)
+
+
+@jax.jit
+def _refine_vertices(scheme: AbstractScheme, topology: Topology, control: Control) -> Float[Array, "w 3"]:
+    return _refine(scheme, topology, control)[0]
+
+
 @jax.jit
 def _refine(
     scheme: AbstractScheme, topology: Topology, control: Control
 ) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
     # Scanners put the origin anywhere. Differences of vertices a metre from it lose digits in float32, most of all in
     # the normals of small faces; every rule is free of the origin, so the middle of the mesh serves.
-    origin = jax.lax.stop_gradient(jnp.mean(control.vertices, axis=0, keepdims=True))
+    origin = jax.lax.stop_gradient(_middle(topology, control.vertices))
     x, n = control.vertices - origin, unit(control.normals)
     h = None if scheme.h is None else scheme.h.astype(x.dtype)
     for i, level in enumerate(topology.levels):
@@ -63,6 +86,14 @@ def _refine(
         return x + origin, n
     n_control = control.vertices.shape[0]
     return jnp.concatenate([control.vertices, x[n_control:] + origin]), n
+
+
+def _middle(topology: Topology, x: Float[Array, "v 3"]) -> Float[Array, "1 3"]:
+    """Mean of the control vertices, spare ones left out."""
+    if topology.real is None:
+        return jnp.mean(x, axis=0, keepdims=True)
+    real = topology.real.control_vertices[:, None]
+    return jnp.sum(jnp.where(real, x, 0.0), axis=0, keepdims=True) / jnp.sum(real).astype(x.dtype)
 
 
 def _at_limit(
@@ -82,9 +113,10 @@ def _at_limit(
 def _check(scheme: AbstractScheme, topology: Topology, control: Control) -> None:
     x, n, v = control.vertices, control.normals, topology.n_control_vertices
     if x.shape != (v, 3) or n.shape != (v, 3):
+        padded = "" if topology.real is None else " For a padded topology, pad them with `pad_control`."
         raise ValueError(
             f"the topology has {v} control vertices, so vertices and normals must both have the shape [{v}, 3]; got "
-            f"{list(x.shape)} and {list(n.shape)}. Batches go through `jax.vmap`."
+            f"{list(x.shape)} and {list(n.shape)}. Batches go through `jax.vmap`.{padded}"
         )
     if x.dtype != n.dtype:
         raise ValueError(f"vertices and normals must have one dtype; got {x.dtype} and {n.dtype}.")

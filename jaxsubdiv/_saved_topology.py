@@ -14,14 +14,14 @@ import numpy as np
 from ._fans import Fan, Fans
 from ._masks import MaskGroup, Masks
 from ._scheme.bezier_triangle import PatchLevel, Places
-from ._topology import Level, LimitMasks, MaskLevel, Topology
+from ._topology import Level, LimitMasks, MaskLevel, Real, Topology
 from .archives import read_arrays
 from .files import replacing
 
 _VERSION = 1
 _KINDS = {
     kind.__name__: kind
-    for kind in (Topology, Level, MaskLevel, PatchLevel, LimitMasks, Masks, MaskGroup, Fans, Fan, Places)
+    for kind in (Topology, Level, MaskLevel, PatchLevel, LimitMasks, Masks, MaskGroup, Fans, Fan, Places, Real)
 }
 
 
@@ -91,7 +91,9 @@ def _built(value: Any, arrays: dict[str, np.ndarray | None]) -> Any:
     module = object.__new__(kind)  # past the converters, which take the arrays of numpy that tables are built from
     hints = get_type_hints(kind)
     for field in dataclasses.fields(kind):
-        part = _built(value[field.name], arrays)
+        # A field with a default may be younger than the file.
+        plain = value[field.name] if field.default is dataclasses.MISSING else value.get(field.name, field.default)
+        part = _built(plain, arrays)
         if not _fits(part, hints[field.name]):
             raise ValueError(f"`{field.name}` of {value['kind']} is not as it should be.")
         object.__setattr__(module, field.name, part)

@@ -11,7 +11,7 @@ from typing import ClassVar, Protocol, runtime_checkable
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 from ._admissible import warn_of_folds
 from ._creases import Creases, Numbers, sharpened
@@ -73,6 +73,16 @@ class LimitMasks(eqx.Module):
     """Vertices whose spline is the limit over each face of the last level, -1 where there is none; see `_patches`."""
 
 
+class Real(eqx.Module):
+    """Which rows of a padded topology are real."""
+
+    control_vertices: Bool[Array, "*batch v"]
+    vertices: Bool[Array, "*batch w"]
+    """Of the refined vertices."""
+    faces: Bool[Array, "*batch f"]
+    """Of the refined faces, the triangles first."""
+
+
 class Topology(eqx.Module):
     """Fixed tables of a refinement: leaves alone, so that meshes of equal sizes share one compilation."""
 
@@ -93,11 +103,13 @@ class Topology(eqx.Module):
     """Whether the last level's normals are those of the refined mesh at the old vertices too."""
     built_for: str = eqx.field(static=True)
     """`tables_for` of the scheme that the tables were built for."""
+    real: Real | None = None
+    """Which rows are real; None where all are. See `pad_topology`."""
 
     @property
     def n_control_vertices(self) -> int:
         """Number of control vertices."""
-        return self.control_fans.order.shape[0]
+        return self.control_fans.order.shape[-1]
 
     @property
     def n_control_faces(self) -> int:

@@ -1,6 +1,7 @@
 """What the engine asks of a scheme, and what the schemes of a kind share."""
 
 from abc import abstractmethod
+from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -14,7 +15,7 @@ from .._masks import Matrix, as_masks, identity, stack
 from .._normals import Boundary, Weights, chord_normals, fan_normals, ring_sum
 from .._stage import Sides, Stage, hybrid_split, sides_of
 from .._topology import AbstractLevel, Level, LimitMasks, MaskLevel, point_normal_level
-from ..linalg import Rows, Vectors, apart, kept_apart, largest, take_each, together, unit, unit_or, where
+from ..linalg import Rows, Vectors, apart, kept_apart, largest, take_each, take_planes, together, unit, unit_or, where
 from .seams import on_seams
 
 OldNormals: TypeAlias = Literal["keep", "recompute"]
@@ -147,7 +148,6 @@ class AbstractPointNormalScheme(AbstractScheme):
         level: Level,
         x: Float[Array, "v 3"],
         n: Float[Array, "v 3"],
-        edges: Edges,
         edge_points: Float[Array, "e 3"],
     ) -> Rows:
         """Positions of the face vertices, one in the middle of every quad."""
@@ -164,7 +164,7 @@ class AbstractPointNormalScheme(AbstractScheme):
         edge_points = _edge_points(self, h, level, values)
         if level.seams is not None:
             edge_points = on_seams(level, x, n, edge_points, h, self.seam_factor)
-        face_points = _face_points(self, h, level, x, n, values, edge_points)
+        face_points = _face_points(self, h, level, x, n, edge_points)
         refined = jnp.concatenate([x, edge_points, face_points])
         edge_normals = _unit_normals(_edge_normal_sums(self, level, values, refined), n, level.edges)
         face_normals = _unit_normals(_face_normal_sums(self, level, edge_points, face_points), n, level.quads)
@@ -191,29 +191,41 @@ def _face_points(
     level: Level,
     x: Float[Array, "v 3"],
     n: Float[Array, "v 3"],
-    values: Float[Array, "v 6"],
     edge_points: Float[Array, "e 3"],
 ) -> Float[Array, "q 3"]:
-    return together(scheme.face_points(h, level, x, n, gather_edges(level, values), edge_points))[0]
+    return together(scheme.face_points(h, level, x, n, edge_points))[0]
+
+
+@kept_apart
+def edge_chord_normals(level: Level, values: Float[Array, "v 6"]) -> Float[Array, "e 3"]:
+    """The normal of every edge, at right angles to it."""
+    (x_a, x_b), (n_a, n_b) = (take_planes(rows, level.edges) for rows in lax.split(values, (3, 3), axis=1))
+    return together(chord_normals(n_a, n_b, x_b - x_a))[0]
 
 
 @kept_apart
 def _edge_normal_sums(
     scheme: AbstractPointNormalScheme, level: Level, values: Float[Array, "v 6"], refined: Float[Array, "w 3"]
-) -> Float[Array, "e 4"]:
+) -> Float[Array, "4 e"]:
     """Eq. (6) around every edge vertex of the refined mesh, and how much of it is rounding."""
     n_old, n_edges = values.shape[0], level.edges.shape[0]
-    edges = gather_edges(level, values)
-    wings = [apart(rows) for rows in take_each(refined, level.wings)]
+    look_up = take_each if scheme.weights == "area" else take_planes
+    (x_a, x_b), wings = (list(map(apart, look_up(refined, table))) for table in (level.edges, level.wings))
     half = len(wings) // 2
-    ring = [edges.x_b, *wings[:half], edges.x_a, *wings[half:]]
+    ring = [x_b, *wings[:half], x_a, *wings[half:]]
     centre = apart(refined[None, n_old : n_old + n_edges])
     total, rounding = ring_sum(centre, ring, scheme.weights, ring_corners(level, n_old))
     if scheme.boundary == "chord":
-        chord = chord_normals(edges.n_a, edges.n_b, edges.d)
-        takes_chord = is_boundary(level, n_old) & (largest(chord) > 0)
+        on_boundary = is_boundary(level, n_old)
+
+        def of_nobody(values: Float[Array, "v 6"]) -> Float[Array, "e 3"]:
+            return jnp.broadcast_to(0 * lax.stop_gradient(values[:1, :3]), (n_edges, 3))  # as in `_unit_normals`
+
+        of_edges = jax.checkpoint(partial(edge_chord_normals, level))
+        chord = apart(lax.cond(jnp.any(on_boundary), of_edges, of_nobody, values)[None])
+        takes_chord = on_boundary & (largest(chord) > 0)
         total, rounding = where(takes_chord, chord, total), where(takes_chord, 0.0, rounding)
-    return jnp.concatenate([*jax.tree.leaves(total), rounding], axis=-1)[0]
+    return jnp.concatenate([*jax.tree.leaves(total), rounding])[..., 0]
 
 
 @kept_apart
@@ -222,17 +234,18 @@ def _face_normal_sums(
     level: Level,
     edge_points: Float[Array, "e 3"],
     face_points: Float[Array, "q 3"],
-) -> Float[Array, "q 4"]:
+) -> Float[Array, "4 q"]:
     """The same around the face vertices."""
-    spokes = [apart(rows) for rows in take_each(edge_points, level.quad_edges)]
+    look_up = take_each if scheme.weights == "area" else take_planes
+    spokes = list(map(apart, look_up(edge_points, level.quad_edges)))
     total, rounding = ring_sum(apart(face_points[None]), spokes, scheme.weights)
-    return jnp.concatenate([*jax.tree.leaves(total), rounding], axis=-1)[0]
+    return jnp.concatenate([*jax.tree.leaves(total), rounding])[..., 0]
 
 
 @kept_apart
-def _unit_normals(sums: Float[Array, "m 4"], n: Float[Array, "v 3"], parents: Int[Array, "m k"]) -> Float[Array, "m 3"]:
+def _unit_normals(sums: Float[Array, "4 m"], n: Float[Array, "v 3"], parents: Int[Array, "m k"]) -> Float[Array, "m 3"]:
     """Unit normals, eq. (6); where the sum vanishes: the unit sum of the parents' normals."""
-    *total, rounding = lax.split(sums, (1, 1, 1, 1), axis=1)
+    *total, rounding = lax.split(sums[..., None], (1, 1, 1, 1), axis=0)
     total = Vectors(*total)
     there = largest(total) > jnp.maximum(rounding, jnp.finfo(sums.dtype).tiny)
 
@@ -242,11 +255,11 @@ def _unit_normals(sums: Float[Array, "m 4"], n: Float[Array, "v 3"], parents: In
 
     def of_nobody(n: Float[Array, "v 3"]) -> Float[Array, "m 3"]:
         # Zeros that under `shard_map` vary over devices as the other branch does.
-        return jnp.broadcast_to(0 * lax.stop_gradient(n[:1]), (sums.shape[0], 3))
+        return jnp.broadcast_to(0 * lax.stop_gradient(n[:1]), (sums.shape[1], 3))
 
     # The parents are looked up only where some sum vanishes: in most meshes none does.
     instead = lax.cond(jnp.all(there), of_nobody, jax.checkpoint(of_parents), n)
-    return together(unit_or(total, apart(instead), rounding))
+    return together(unit_or(total, apart(instead[None]), rounding))[0]
 
 
 class AbstractLinearScheme(AbstractScheme):
@@ -316,11 +329,12 @@ def ring_corners(level: Level, n_old: int) -> Bool[Array, "k 1 e 1"]:
 
     They are not where the ring stays at a quad's centre, nor where, on a boundary, it runs through the edge vertex.
     """
-    half = level.wings.shape[1] // 2
-    ring = jnp.stack([level.edges[:, 1], *level.wings.T[:half], level.edges[:, 0], *level.wings.T[half:]])
-    itself = n_old + jnp.arange(ring.shape[1], dtype=ring.dtype)[None]
-    after = jnp.roll(ring, -1, axis=0)
-    return ((ring != after) & (ring != itself) & (after != itself))[:, None, :, None]
+    half, (start, end), wings = level.wings.shape[1] // 2, level.edges.T, level.wings.T
+    ring = [end, *wings[:half], start, *wings[half:]]
+    itself = n_old + jnp.arange(len(start), dtype=start.dtype)
+    pairs = zip(ring, [*ring[1:], ring[0]], strict=True)
+    corners = [(one != after) & (one != itself) & (after != itself) for one, after in pairs]
+    return jnp.stack(corners)[:, None, :, None]
 
 
 def corner_total(level: Level, values: Float[Array, "v 3"]) -> Float[Array, "1 q 3"]:

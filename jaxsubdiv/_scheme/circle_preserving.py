@@ -3,13 +3,15 @@
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from .._normals import Boundary, Weights, chord_normals
 from .._topology import Level
-from ..linalg import Rows, Vectors, apart, dot, take_each, together, unit, where
-from .base import AbstractPointNormalScheme, Edges, tangent_length
+from ..linalg import Rows, Vectors, dot, kept_apart, take_planes, unit, where
+from .base import AbstractPointNormalScheme, Edges, edge_chord_normals, tangent_length
 from .interpolating import edge_rule
 
 
@@ -64,12 +66,25 @@ class CirclePreserving(AbstractPointNormalScheme):
         level: Level,
         x: Float[Array, "v 3"],
         n: Float[Array, "v 3"],
-        edges: Edges,
         edge_points: Float[Array, "e 3"],
     ) -> Vectors:
-        edge_normals = together(chord_normals(edges.n_a, edges.n_b, edges.d))[0]
-        q_ij, q_jk, q_kl, q_li = map(apart, take_each(edge_points, level.quad_edges))
-        n_ij, n_jk, n_kl, n_li = map(apart, take_each(edge_normals, level.quad_edges))
-        a, b = arc_rule(h, q_ij, q_kl, n_ij, n_kl), arc_rule(h, q_jk, q_li, n_jk, n_li)
-        n_a, n_b = chord_normals(n_ij, n_kl, q_kl - q_ij), chord_normals(n_jk, n_li, q_li - q_jk)
+        edge_normals = edge_chord_normals(level, jnp.concatenate([x, n], axis=1))
+        q_ij, q_jk, q_kl, q_li = take_planes(edge_points, level.quad_edges)
+        n_ij, n_jk, n_kl, n_li = take_planes(edge_normals, level.quad_edges)
+        a, n_a = _middle(h, q_ij, q_kl, n_ij, n_kl)
+        b, n_b = _middle(h, q_jk, q_li, n_jk, n_li)
         return arc_rule(h, a, b, n_a, n_b)
+
+
+def _middle(h: Float[Array, ""], x_a: Vectors, x_b: Vectors, n_a: Vectors, n_b: Vectors) -> tuple[Vectors, Vectors]:
+    """Point in the middle of a curve across a face, and the normal there."""
+    middle = lax.split(_stacked_middle(h, x_a, x_b, n_a, n_b), (1,) * 6, axis=0)
+    return Vectors(*middle[:3]), Vectors(*middle[3:])
+
+
+@kept_apart
+def _stacked_middle(
+    h: Float[Array, ""], x_a: Vectors, x_b: Vectors, n_a: Vectors, n_b: Vectors
+) -> Float[Array, "6 q 1"]:
+    rules = arc_rule(h, x_a, x_b, n_a, n_b), chord_normals(n_a, n_b, x_b - x_a)
+    return jnp.concatenate(jax.tree.leaves(rules))

@@ -84,7 +84,6 @@ class Interpolating(AbstractPointNormalScheme):
         level: Level,
         x: Float[Array, "v 3"],
         n: Float[Array, "v 3"],
-        edges: Edges,
         edge_points: Float[Array, "e 3"],
     ) -> Float[Array, "1 q 3"]:
         centre = coons_centre(level, x, edge_points)
