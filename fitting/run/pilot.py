@@ -17,7 +17,7 @@ from .fit import fit
 # A start that is the fit of the pilot's own scan is expected to return bit by bit, noise included: the scan is found
 # to be as like the start as can be, and the deviations that are left are those of the sweeps, not of anatomy. A start
 # may have had another h, so that its distances fall a little.
-_LIKE, _HARDLY_FELL, _NOTHING_LEFT = 0.5, 3.0, 0.003  # the last in control edges
+_LIKE, _HARDLY_FELL, _NOTHING_LEFT = 0.5, 2.2, 0.02  # the last in control edges
 
 
 def make_pilot(

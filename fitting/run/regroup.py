@@ -59,7 +59,7 @@ def regroup(
         options: more for `fit_cohort`; they come before the cohort's own.
 
     Raises:
-        ValueError: there are fewer than two subjects; or as `fit_cohort` does.
+        ValueError, ScanError: as `fit_cohort` does.
 
     Source: A. Guimond et al., Average brain models: a convergence study, 2000.
     """
@@ -77,17 +77,18 @@ def regroup(
     if np.isfinite(own["priors"].symmetry):
         own["symmetry"] = first.inputs.get("symmetry") or symmetry
     mean, moved, rests = _mean_shape(cohort, symmetry), [], False
-    edge = float(js.edge_length(topology, jnp.asarray(mean, cohort.control.vertices.dtype)))
+    dtype = cohort.control.vertices.dtype
+    edge = float(js.edge_length(topology, jnp.asarray(mean, dtype)))
     for number in range(1, rounds + 1):
         say(f"fits all from their mean, round {number}")
         shapes = np.asarray(cohort.control.vertices, np.float64)
-        controls = [_control(scheme, topology, align_shape(mean, shape), shapes.dtype) for shape in shapes]
+        controls = [_control(scheme, topology, align_shape(mean, shape), dtype) for shape in shapes]
         here = dict(own)
         if first.inputs.get("landmarks") is not None:
             here["landmarks"] = [_landmarks_on(*one, told) for one in zip(fits, controls, strict=True)]
         cohort = fit_cohort(scheme, topology, controls, cohort.scans, **(here | options))
         last, mean = mean, _mean_shape(cohort, symmetry)
-        moved.append(_distance(scheme, topology, last, mean, cohort.control.vertices.dtype))
+        moved.append(_distance(scheme, topology, last, mean, dtype))
         rests = moved[-1] < _AT_REST * edge
         if rests:
             break
