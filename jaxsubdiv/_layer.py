@@ -1,5 +1,6 @@
 """The refinement as a layer of a network: control vertices in, a smooth surface out."""
 
+import functools
 import math
 from typing import Any
 
@@ -53,7 +54,8 @@ class SurfaceLayer(eqx.Module):
 
         Args:
             scheme: the rules, and the h to start from or to keep.
-            topology: tables from `build_topology`, whose number of levels is that of the layer.
+            topology: tables from `build_topology`, whose number of levels is that of the layer. Padded ones from
+                `pad_topology` serve too, and those of different meshes from `stack_topologies`.
             train_h: whether h is a parameter.
             h_range: of a trained h. The limit surface is smooth for 0 < h < 3; the default range keeps away from both
                 ends.
@@ -105,21 +107,28 @@ class SurfaceLayer(eqx.Module):
         """The refined surface of one control mesh, or of a batch of them.
 
         Args:
-            vertices: control vertices, with any leading axes.
+            vertices: control vertices, with any leading axes; for stacked topologies with one, a row a mesh. Spare
+                vertices of padded topologies are ignored.
             normals: control normals of any length, with the same leading axes, or `[v, 3]` for all of them. Default:
                 those of the control faces, eqs. (4)-(6) with the weights of the area, differentiable in the vertices.
             key: not used; layers of equinox take one.
 
         Returns:
-            Vertices and normals with the leading axes of `vertices`; the faces are those of the topology, without
-            leading axes. float16 and bfloat16 are widened: the result is float32, or float64 if an argument is.
+            Vertices and normals with the leading axes of `vertices`. The faces are those of the topology, without
+            leading axes unless it is stacked. float16 and bfloat16 are widened: the result is float32, or float64 if an
+            argument is.
 
         Raises:
             ValueError: at trace time, if the shapes do not fit the topology or one another.
         """
         scheme, topology = self.scheme, self.topology
         vertices = jnp.asarray(vertices)
-        shape = vertices.shape
+        shape, meshes = vertices.shape, topology.control_fans.order.shape[:-1]
+        if meshes and shape[:-2] != meshes:
+            raise ValueError(
+                f"the topology has the tables of {meshes[0]} meshes, so `vertices` must have the shape [{meshes[0]}, "
+                f"{topology.n_control_vertices}, 3]; got {list(shape)}. More axes go through `jax.vmap`."
+            )
         if shape[-2:] != (topology.n_control_vertices, 3):
             raise ValueError(
                 f"the topology has {topology.n_control_vertices} control vertices, so `vertices` must have the shape "
@@ -135,16 +144,24 @@ class SurfaceLayer(eqx.Module):
         wide = any(a is not None and a.dtype == jnp.float64 for a in (vertices, normals))
         dtype = jnp.dtype(jnp.float64 if wide else jnp.float32)
 
-        def one(
-            vertices: Float[Array, "v 3"], normals: Float[Array, "v 3"] | None
-        ) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
+        vertices = vertices.astype(dtype)
+        normals = None if normals is None else jnp.broadcast_to(normals.astype(dtype), shape)
+
+        def one(topology: Topology, vertices: Any, normals: Any) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
+            if topology.real is not None:  # a spare vertex lies on the first one
+                there = topology.real.control_vertices[:, None]
+                vertices = jnp.where(there, vertices, vertices[:1])
+                normals = None if normals is None else jnp.where(there, normals, normals[:1])
             if normals is None:
                 normals = estimate_normals(topology.control_fans, vertices)
             surface = refine(scheme, topology, Control(vertices, normals))
             return surface.vertices, surface.normals
 
-        vertices = vertices.astype(dtype)
-        normals = None if normals is None else jnp.broadcast_to(normals.astype(dtype), shape)
-        for _ in shape[:-2]:
-            one = jax.vmap(one)
-        return RefinedSurface(*one(vertices, normals), topology.faces)
+        if meshes:
+            found = jax.vmap(one)(topology, vertices, normals)
+        else:
+            of_control = functools.partial(one, topology)
+            for _ in shape[:-2]:
+                of_control = jax.vmap(of_control)
+            found = of_control(vertices, normals)
+        return RefinedSurface(*found, topology.faces)

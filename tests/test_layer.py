@@ -37,6 +37,36 @@ def test_it_is_refine_for_any_leading_axes():
     np.testing.assert_allclose(shared.normals[1], call(LAYER, BATCH[1], N).normals, atol=1e-12)
 
 
+def test_different_meshes_are_refined_at_once():
+    meshes_ = [MESH, js.ControlMesh(*meshes.tetrahedron())]
+    alone = [js.build_topology(mesh, js.Interpolating(), 1) for mesh in meshes_]
+    stacked = js.stack_topologies(alone)
+    layer, there = js.SurfaceLayer(js.Interpolating(), stacked), np.asarray(stacked.real.control_vertices)
+    rows = jnp.stack([js.pad_control(stacked, mesh.control()).vertices for mesh in meshes_])
+    cloud = jnp.asarray(np.random.default_rng(1).normal(size=(2, 20, 3)))
+
+    @jax.jit
+    def find(layer, rows):
+        def losses(rows):
+            surfaces = layer(rows)
+            each = js.losses.chamfer_distance(surfaces, cloud) + js.losses.inverted_faces(surfaces, margin=2.0)
+            return jnp.sum(each), (surfaces, each)
+
+        return jax.grad(losses, has_aux=True)(rows)
+
+    spoilt = jnp.where(there[..., None], rows, 7.0)  # a network predicts anything there
+    slope, (surfaces, each) = find(layer, spoilt)
+    assert np.all(slope[~there] == 0) and np.isfinite(slope).all() and np.all(slope[there] != 0, axis=1).any()
+    for i, mesh in enumerate(meshes_):
+        one = js.refine(js.Interpolating(), alone[i], mesh.control())
+        padded = jax.tree.map(lambda leaf, i=i: leaf[i], (stacked, surfaces))
+        real = js.cut_padding(*padded)
+        np.testing.assert_allclose(real.vertices, one.vertices, atol=1e-12)
+        np.testing.assert_allclose(real.normals, one.normals, atol=1e-12)
+    expected = js.losses.chamfer_distance(one, cloud[1]) + js.losses.inverted_faces(one, margin=2.0)
+    np.testing.assert_allclose(each[1], expected, rtol=1e-9)
+
+
 def test_narrow_numbers_are_widened_inside():
     narrow = X.astype(jnp.bfloat16)
     found = call(LAYER, narrow)
@@ -153,6 +183,9 @@ def test_bad_arguments_are_refused_with_words(as_users_run):
         "two finite numbers, the smaller one first": lambda: js.SurfaceLayer(
             js.Interpolating(), TOPOLOGY, train_h=True, h_range=(2, 0)
         ),
+        r"the tables of 1 meshes, so `vertices` must have the shape \[1, 10, 3\]": lambda: js.SurfaceLayer(
+            js.Interpolating(), js.stack_topologies([TOPOLOGY])
+        )(BATCH),
         r"shape \[..., 6, 3\]; got \[5, 3\]": lambda: LAYER(X[:5]),
         r"the shape of `vertices`, \[2, 6, 3\], or \[6, 3\]": lambda: LAYER(BATCH, BATCH[:1]),
         "a whole number from 1 on": lambda: js.memory_of(js.Interpolating(), TOPOLOGY, batch=0),
