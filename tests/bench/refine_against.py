@@ -161,7 +161,8 @@ def main() -> None:
         print(f"| {name}, CPU ms | {1e3 * mine:.2f} | {1e3 * other:.2f} | {mine / other:.2f} |", flush=True)
     for name, value in ours.items():
         before = theirs.get(name)
-        print(f"| {name} | {value:.2f} | {before or '-'} | {value / before if before else '-'} |")
+        of_other = "- | -" if before is None else f"{before:.2f} | {value / before if before else 1:.2f}"
+        print(f"| {name} | {value:.2f} | {of_other} |")
     for process in processes:
         process.terminate()
 
