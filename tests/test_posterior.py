@@ -28,8 +28,9 @@ from fitting.solve.elements import (
     normal_matrix,
     times_transposed,
 )
-from fitting.solve.sparse_normal import SparseEquations, find_structure, row_faces
+from fitting.solve.sparse_normal import SparseEquations
 from fitting.solve.strengths import Family, neighbourhood_mean, next_precisions
+from fitting.solve.structure import find_structure, row_faces
 
 # Derivatives by elements
 

@@ -15,7 +15,7 @@ import jaxsubdiv as js
 from fitting.__main__ import main as command
 from fitting.model.unknowns import Layout, Variables
 from fitting.scan.frames import place_frames
-from fitting.solve.sparse_normal import solve_preconditioned
+from fitting.solve.arrowhead import solve_preconditioned
 from fitting.start.cavities import find_parts, find_valves
 
 N = 4

@@ -17,8 +17,9 @@ from ..model.residual import Held, Model
 from ..model.unknowns import Variables
 from ..scan.regions import RegionMatch
 from ..scan.scan import Scan
-from ..solve.sparse_normal import SparseEquations, Structure, find_structure
+from ..solve.sparse_normal import SparseEquations
 from ..solve.strengths import Strengths
+from ..solve.structure import Structure, find_structure
 from ..solve.sweeps import HOLD, active_unknowns, hold_priors, hold_sweep, loose_damping, measure_look
 
 

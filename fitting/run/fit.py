@@ -36,8 +36,9 @@ from ..scan.regions import RegionMatch
 from ..scan.scan import Scan, ScanError
 from ..solve.conjugate_gradients import ConjugateGradients
 from ..solve.pilot import FromPilot
-from ..solve.sparse_normal import SparseNormal, find_structure
+from ..solve.sparse_normal import SparseNormal
 from ..solve.strengths import FromScan, first_strengths
+from ..solve.structure import find_structure
 from ..solve.sweeps import State, Subject, Sweeps, hold_priors, subject_residual
 from ..start.folds import Folds, unfolded_start
 from .checkpoint import Checkpoint

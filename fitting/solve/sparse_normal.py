@@ -6,8 +6,7 @@ that all rows share, as h, shifts of slices or scores of shape modes, and B both
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,239 +16,25 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
 
-import jaxsubdiv as js
-
 from ..model.priors import AbstractVertexPrior
 from ..model.priors.shifts import ShiftPrior
 from ..model.residual import Held, Model, signed_distances
-from ..model.unknowns import Layout, Unknowns, Variables
-from .cholesky import Factor, Symbolic
-from .cholesky import analyse as analyse_pattern
+from ..model.unknowns import Unknowns, Variables
+from .arrowhead import Arrowhead, ArrowheadFactor, factorise_arrowhead, solve_preconditioned
 from .elements import (
-    Elements,
-    Patches,
     are_many,
-    colour,
     differentiate,
     distance_matrix,
     distances_transposed,
-    find_elements,
-    find_patches,
-    forgets_some,
     jacobian,
     normal_matrix,
     slopes_of_distances,
     slopes_of_rows,
     times_transposed,
 )
+from .structure import Structure, Tied, find_structure, row_faces, sparse_rows
 
-_MOST_RINGS = 3
-_SOLVED, _MOST_STEPS = 1e-2, 100  # of conjugate gradients: of the norm of what is left, in that of the near part
 _REGULAR = 1e-12  # of the largest entry: what no row determines stays
-
-
-class Arrowhead(NamedTuple):
-    """A symmetric matrix [A B; B' C]."""
-
-    inner: Float[np.ndarray, "e"]
-    """Values of A, in the pattern of a `Structure`."""
-    border: Float[np.ndarray, "o k"]
-    corner: Float[np.ndarray, "k k"]
-
-    def plus(self, other: "Arrowhead") -> "Arrowhead":
-        """The sum of both."""
-        return Arrowhead(*(a + b for a, b in zip(self, other, strict=True)))
-
-
-class ArrowheadFactor(NamedTuple):
-    """A factorised arrowhead: A by Cholesky, and the Schur complement of A, which is small and dense."""
-
-    inner: Factor
-    border: Float[np.ndarray, "o k"]
-    solved_border: Float[np.ndarray, "o k"]
-    """A^-1 B."""
-    shared_covariance: Float[np.ndarray, "k k"]
-    """(C - B' A^-1 B)^-1."""
-
-    def solve(self, sides: Float[np.ndarray, "n *s"]) -> Float[np.ndarray, "n *s"]:
-        """The solution for every right side."""
-        n = len(self.border)
-        own = self.inner.solve(sides[:n])
-        shared = self.shared_covariance @ (sides[n:] - self.border.T @ own)
-        return np.concatenate([own - self.solved_border @ shared, shared])
-
-    def covariance_blocks(self, columns: Int[np.ndarray, "f d"]) -> Float[np.ndarray, "f d d"]:
-        """Blocks of the inverse, for unknowns of vertices that are coupled, and shared ones; -1 is no unknown."""
-        n, k = self.solved_border.shape
-        border = np.concatenate([self.solved_border, -np.eye(k), np.zeros((1, k))])[columns]
-        own = self.inner.inverse_blocks(np.where((columns >= 0) & (columns < n), columns, n))
-        return own + border @ self.shared_covariance @ border.transpose(0, 2, 1)
-
-    def sample(self, normal: Float[np.ndarray, "n s"]) -> Float[np.ndarray, "n s"]:
-        """Vectors with the inverse as their covariance, from standard normal numbers."""
-        n = len(self.border)
-        values, vectors = np.linalg.eigh(self.shared_covariance)
-        shared = vectors @ (np.sqrt(np.maximum(values, 0))[:, None] * normal[n:])
-        return np.concatenate([self.inner.sample(normal[:n]) - self.solved_border @ shared, shared])
-
-
-class _Tied(NamedTuple):
-    """Which unknowns the rows of a prior that ties vertices depend on."""
-
-    prior: str
-    seeds: Float[np.ndarray, "s n"]
-    seeds_of: Int[np.ndarray, "m d"]
-    columns: Int[np.ndarray, "m d"]
-    """`n` where there are fewer than in other rows."""
-    is_distant: bool
-
-
-@dataclass(frozen=True, eq=False)
-class Structure:
-    """What the analysis of a model finds: the same for all sweeps."""
-
-    layout: Layout
-    elements: Elements
-    patches: Patches
-    tied: list[_Tied]
-    pattern: sp.csc_array
-    """Of A."""
-    near: sp.csc_array | None
-    """Without the rows of priors that couple vertices far from each other; None where there are none."""
-    diagonal: Int[np.ndarray, "o"]
-    """Where in A's values its diagonal stands."""
-    fixed_entries: Int[np.ndarray, "_"]
-    """Where the rows and columns of fixed unknowns stand."""
-    from_elements: tuple[Int[np.ndarray, "_"], Int[np.ndarray, "_"]]
-    """Entries of the elements' pattern that belong to A, and where they stand there."""
-
-    @property
-    def n(self) -> int:
-        """Number of unknowns of A."""
-        return self.layout.n_own
-
-    @functools.cached_property
-    def symbolic(self) -> Symbolic:
-        """Order of elimination of A."""
-        return analyse_pattern(self.pattern)
-
-    @functools.cached_property
-    def near_symbolic(self) -> tuple[Symbolic, Int[np.ndarray, "_"]]:
-        """Order of elimination of the near part of A, and where its entries stand among A's."""
-        assert self.near is not None
-        return analyse_pattern(self.near), np.searchsorted(_keys(self.pattern), _keys(self.near))
-
-    @property
-    def corners(self) -> Int[np.ndarray, "g 4"]:
-        """Vertices of every face of the surface; the last of a triangle twice."""
-        patches = self.patches
-        return patches.vertices[patches.owner[:, None], patches.slots]
-
-    def arrange(self, values: Float[np.ndarray, "_"], n_shared: int) -> Arrowhead:
-        """The arrowhead of values in the pattern of the elements, in which h stands after the unknowns of vertices."""
-        of_elements, n = self.elements.pattern, self.n
-        inner = np.zeros(self.pattern.nnz)
-        source, place = self.from_elements
-        inner[place] = values[source]
-        border, corner = np.zeros((n, n_shared)), np.zeros((n_shared, n_shared))
-        n_h = self.elements.n - n
-        for j in range(n_h):
-            run = slice(*of_elements.indptr[n + j : n + j + 2])
-            rows = of_elements.indices[run]
-            border[rows[rows < n], j] = values[run][rows < n]
-            corner[rows[rows >= n] - n, j] = values[run][rows >= n]
-        return Arrowhead(inner, border, corner)
-
-    def arrange_sparse(self, matrix: sp.csc_array) -> Arrowhead:
-        """The arrowhead of a sparse matrix of all unknowns, whose part in A lies in the pattern."""
-        n = self.n
-        own = sp.csc_array(matrix[:n, :n])
-        inner = np.zeros(self.pattern.nnz)
-        np.add.at(inner, np.searchsorted(_keys(self.pattern), _keys(own)), own.data)
-        return Arrowhead(inner, matrix[:n, n:].toarray(), matrix[n:, n:].toarray())
-
-
-def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> Structure:
-    """Find which unknowns belong to which rows: so few rings of faces that explain all derivatives.
-
-    Args:
-        held: what each prior holds where a fit starts.
-
-    Raises:
-        ValueError: a face of the scheme depends on too many control vertices.
-    """
-    model = model.bare()
-    surface = model.refine(y)
-    owner = js.control_faces_of(model.scheme, model.topology, surface, y.control)
-    patches = find_patches(surface, owner, model.topology.n_control_faces)
-    rows = row_faces(model, held)
-    for rings in range(1, _MOST_RINGS + 1):
-        elements = find_elements(model, rings)
-        found = differentiate(model, y, held, elements.seeds)
-        if not forgets_some(elements, patches, found, rows):
-            break
-    else:
-        raise ValueError(
-            f"a face of {type(model.scheme).__name__} depends on control vertices more than {_MOST_RINGS} rings of "
-            "faces away: the fit has no sparse derivatives to work with."
-        )
-    layout, n = model.layout, model.layout.n_own
-    tied = [_tie(model, prior) for prior in model.vertex_priors]
-    pattern = sp.csc_array(abs(sp.csc_array(elements.pattern.astype(float))[:n, :n])) + sp.eye_array(n, format="csc")
-    pattern.data[:] = 1
-    near = None
-    for one in sorted(tied, key=lambda one: one.is_distant):
-        if one.is_distant and near is None:
-            near = _sorted(pattern)
-        by = _sparse(np.ones(one.columns.shape), one.columns, layout.n)
-        pattern = pattern + abs(sp.csc_array((by.T @ by)[:n, :n]))
-    pattern = _sorted(pattern)
-    keys, column = _keys(pattern), _columns(pattern)
-    of_elements = elements.pattern
-    source = np.flatnonzero((of_elements.indices < n) & (_columns(of_elements) < n))
-    place = np.searchsorted(keys, _columns(of_elements)[source].astype(np.int64) * n + of_elements.indices[source])
-    fixed = np.asarray(model.is_free)[:n] == 0
-    return Structure(
-        layout,
-        elements,
-        patches,
-        tied,
-        pattern,
-        near,
-        np.flatnonzero(pattern.indices == column),
-        np.flatnonzero(fixed[pattern.indices] | fixed[column]),
-        (source, place),
-    )
-
-
-def row_faces(model: Model, held: dict[str, Any]) -> Int[np.ndarray, "m"]:
-    """The control face of every row of the face priors."""
-    faces = [np.asarray(prior.faces(held[prior.name])) for prior in model.face_priors]
-    return np.concatenate([np.zeros(0, int), *faces]).astype(int)
-
-
-def _tie(model: Model, prior: AbstractVertexPrior) -> _Tied:
-    layout, vertices = model.layout, prior.vertices()
-    m, c = vertices.shape
-    there = vertices >= 0
-    incidence = sp.csr_array(
-        (np.ones(there.sum(), np.int32), (np.nonzero(there)[0], vertices[there])), shape=(m, layout.n_vertices)
-    )
-    colours = colour(incidence) if c else np.zeros(layout.n_vertices, int)
-    n_colours = int(colours.max(initial=-1)) + 1 if c else 0
-    width, parts = layout.width, np.arange(layout.width)
-    columns = np.where(there[..., None], vertices[..., None] * width + parts, layout.n).reshape(m, -1)
-    seeds_of = np.where(there[..., None], colours[vertices][..., None] * width + parts, 0).reshape(m, -1)
-    seeds = np.zeros((n_colours * width, layout.n))
-    if c:
-        own = np.arange(layout.n_own)
-        seeds[colours[own // max(width, 1)] * width + own % max(width, 1), own] = 1
-    for name in prior.uses:
-        places = np.arange(layout.n)[layout.columns(name)]
-        seeds_of = np.concatenate([seeds_of, np.tile(len(seeds) + np.arange(len(places)), (m, 1))], axis=1)
-        columns = np.concatenate([columns, np.tile(places, (m, 1))], axis=1)
-        seeds = np.concatenate([seeds, places[:, None] == np.arange(layout.n)])
-    return _Tied(prior.name, seeds, seeds_of, columns, prior.is_distant)
 
 
 @eqx.filter_jit
@@ -356,15 +141,12 @@ class SparseEquations:
             active: which shared unknowns take part; the others stay.
             near: without the entries of priors that couple vertices far from each other, which take time.
         """
-        structure, n = self.structure, self.structure.n
-        values, border, corner = self._damped(matrix, damping, active)
-        pattern, symbolic = structure.pattern, structure.near_symbolic[0] if near else structure.symbolic
-        if near:
-            assert structure.near is not None
-            pattern, values = structure.near, values[structure.near_symbolic[1]]
-        factor = symbolic.factorise(sp.csc_array((values, pattern.indices, pattern.indptr), shape=(n, n)))
-        solved = factor.solve(border) if border.shape[1] else border
-        return ArrowheadFactor(factor, border, solved, _inverse(corner - border.T @ solved))
+        structure, damped = self.structure, self._damped(matrix, damping, active)
+        if not near:
+            return factorise_arrowhead(damped, structure.pattern, structure.symbolic)
+        assert structure.near is not None
+        symbolic, place = structure.near_symbolic
+        return factorise_arrowhead(damped._replace(inner=damped.inner[place]), structure.near, symbolic)
 
     def _damped(
         self, matrix: Arrowhead, damping: Float[np.ndarray, "n"], active: Bool[np.ndarray, "k"] | None
@@ -505,13 +287,13 @@ class SparseEquations:
         matrix.corner[shifts, shifts] += (by_shifts.T @ weighed).toarray()
         self.gradient[columns] += weighed.T @ rows
 
-    def _add_tied(self, tied: _Tied) -> Arrowhead:
+    def _add_tied(self, tied: Tied) -> Arrowhead:
         prior, layout = self._bare.prior(tied.prior), self.model.layout
         assert isinstance(prior, AbstractVertexPrior)
         rows, by = _differentiate_tied(self._bare, prior, self.y, self.held.priors[prior.name], tied.seeds)
         rows, by = np.asarray(rows, np.float64), np.asarray(by, np.float64)
         by = np.take_along_axis(by.T, tied.seeds_of, axis=1) if len(by) else np.zeros(tied.columns.shape)
-        found = _sparse(by, tied.columns, layout.n)
+        found = sparse_rows(by, tied.columns, layout.n)
         weights = np.broadcast_to(np.asarray(self.held.precisions[prior.name], np.float64), rows.shape)
         self._tied_jacobians[prior.name] = found
         self.values[prior.name] = rows
@@ -585,78 +367,13 @@ def _solve(
     matrix = structure.arrange(normal_matrix(elements, local, np.ones(len(left)), face), n_shared)
     for tied, (values, along) in zip(structure.tied, of_ties, strict=True):
         values, along = np.asarray(values, np.float64), np.asarray(along, np.float64)
-        found = _sparse(np.take_along_axis(along.T, tied.seeds_of, axis=1), tied.columns, n)
+        found = sparse_rows(np.take_along_axis(along.T, tied.seeds_of, axis=1), tied.columns, n)
         gradient += found.T @ values
         matrix = matrix.plus(structure.arrange_sparse(sp.csc_array(found.T @ found)))
-    pattern = structure.pattern
     values = matrix.inner.copy()
     values[structure.diagonal] += _REGULAR * np.abs(values[structure.diagonal]).max()
-    inner = sp.csc_array((values, pattern.indices, pattern.indptr), shape=(structure.n, structure.n))
-    factor = structure.symbolic.factorise(inner)
-    solved = factor.solve(matrix.border) if n_shared else matrix.border
-    whole = ArrowheadFactor(factor, matrix.border, solved, _inverse(matrix.corner - matrix.border.T @ solved))
-    return whole.solve(gradient).astype(jax.dtypes.canonicalize_dtype(np.float64))
-
-
-def _sparse(by: Float[np.ndarray, "m d"], columns: Int[np.ndarray, "m d"], n: int) -> sp.csr_array:
-    """A sparse matrix from its rows; columns of `n` are left out."""
-    m, d = columns.shape
-    table = sp.csr_array(
-        (by.ravel(), columns.ravel(), np.arange(0, m * d + 1, d) if d else np.zeros(m + 1, int)), shape=(m, n + 1)
-    )
-    return sp.csr_array(table[:, :n])
-
-
-def solve_preconditioned(
-    multiply: Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray, "n s"]],
-    precondition: Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray, "n s"]],
-    sides: Float[np.ndarray, "n s"],
-) -> Float[np.ndarray, "n s"]:
-    """Solutions with a symmetric positive matrix that is given by its products, for all right sides at once, by
-    conjugate gradients, with another such matrix that is near to it and easily solved with."""
-    x, left = np.zeros_like(sides), sides.copy()
-    way = precondition(left)
-    along = np.sum(left * way, axis=0)
-    target = _SOLVED**2 * along
-    for _ in range(_MOST_STEPS):
-        if np.all(along <= target):
-            break
-        there = multiply(way)
-        pace = along / np.maximum(np.sum(way * there, axis=0), np.finfo(float).tiny)
-        x += pace * way
-        left -= pace * there
-        next_way = precondition(left)
-        new = np.sum(left * next_way, axis=0)
-        way = next_way + new / np.maximum(along, np.finfo(float).tiny) * way
-        along = new
-    return x
-
-
-def _sorted(pattern: sp.sparray) -> sp.csc_array:
-    sorted_pattern = sp.csc_array(pattern)
-    sorted_pattern.sort_indices()
-    return sorted_pattern
-
-
-def _columns(pattern: sp.csc_array) -> Int[np.ndarray, "e"]:
-    """The column of every entry."""
-    return np.repeat(np.arange(len(pattern.indptr) - 1), np.diff(pattern.indptr))
-
-
-def _keys(pattern: sp.csc_array) -> Int[np.ndarray, "e"]:
-    """A number for every entry, by column and row."""
-    return _columns(pattern).astype(np.int64) * pattern.shape[0] + pattern.indices  # pyright: ignore[reportOptionalSubscript]
-
-
-def _inverse(matrix: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
-    """The inverse of a small symmetric matrix; what has no curvature (the plane of a mesh that is one point) stays."""
-    if not len(matrix):
-        return matrix
-    scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(matrix)), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(scale[:, None] * (matrix + matrix.T) / 2 * scale)
-    least = len(matrix) * np.finfo(float).eps * max(values.max(), 0)
-    inverse = np.where(values > least, 1 / np.where(values > least, values, 1), 0)
-    return scale[:, None] * (vectors * inverse) @ vectors.T * scale
+    factor = factorise_arrowhead(matrix._replace(inner=values), structure.pattern, structure.symbolic)
+    return factor.solve(gradient).astype(jax.dtypes.canonicalize_dtype(np.float64))
 
 
 def sparse_solver(model: Model, y: Variables, held: Held) -> SparseNormal:
