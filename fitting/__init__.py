@@ -34,6 +34,7 @@ from .model.robust import geman_mcclure as geman_mcclure
 from .model.unknowns import Free as Free
 from .report.animation import animate_series as animate_series
 from .report.cohort import Cohort as Cohort
+from .report.fit_measures import Measure as Measure
 from .report.page import write_page as write_page
 from .report.picture import draw_fit as draw_fit
 from .report.picture import draw_slices as draw_slices

@@ -79,7 +79,20 @@ def test_report_and_uncertainty_of_a_loaded_fit_are_the_same(saved):
     assert found.keys() == expected.keys() and found["worst"] == expected["worst"]
     assert found["warnings"] == expected["warnings"] and found["pose"] == expected["pose"]
     assert found["frame"] == expected["frame"] and found["crossings_at"] == expected["crossings_at"]
-    for name in set(found) - {"worst", "reason", "h", "rms_per_sweep", "warnings", "pose", "frame", "crossings_at"}:
+    for one, other in zip(found["measures"], expected["measures"], strict=True):
+        assert one["name"] == other["name"] and one["unit"] == other["unit"]
+        np.testing.assert_allclose([one["value"], one["deviation"]], [other["value"], other["deviation"]], rtol=1e-8)
+    for name in set(found) - {
+        "worst",
+        "reason",
+        "h",
+        "rms_per_sweep",
+        "warnings",
+        "pose",
+        "frame",
+        "crossings_at",
+        "measures",
+    }:
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-9, err_msg=name)
 
 
@@ -210,7 +223,7 @@ def test_fit_of_version_3_has_the_report_that_it_had(name, tmp_path):
 
 def old_report(found: fitting.FitResult) -> dict:
     """What reports had at that time."""
-    newer = ("trusted", "warnings", "pose", "frame", "regions", "crossing_triangles", "crossings_at")
+    newer = ("trusted", "warnings", "pose", "frame", "regions", "crossing_triangles", "crossings_at", "measures")
     return {name: value for name, value in found.report(uncertainty=True).as_dict().items() if name not in newer}
 
 

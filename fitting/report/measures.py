@@ -1,15 +1,14 @@
 """What is measured of a surface whose parts bound cavities: volumes, mass, areas, thickness of the wall."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 import jaxsubdiv as js
-from jaxsubdiv.linalg import cross, norm
+from jaxsubdiv.linalg import norm
 
 from ..scan.closest_points import closest_points
 from ..start.cavities import Part, find_parts
@@ -23,14 +22,6 @@ class Column(NamedTuple):
 
     name: str
     unit: str
-
-
-class _PartTables(eqx.Module):
-    """A part of a refined surface."""
-
-    triangles: Int[np.ndarray, "t 3"]
-    rims: tuple[tuple[Int[np.ndarray, "_"], Int[np.ndarray, "_"]], ...]
-    """Of every opening the vertices around it, and the next of each."""
 
 
 class Walls(NamedTuple):
@@ -47,6 +38,7 @@ class Measures:
     """The numbers that a surface is measured by, with their tables: the same for all frames of a series.
 
     Args:
+        topology: tables of the surface.
         surface: any of the series, in its place.
         owner: the control face of every face of the surface.
         mesh: a control mesh, whose `regions` are the groups.
@@ -54,16 +46,18 @@ class Measures:
     """
 
     def __init__(
-        self, surface: js.RefinedSurface, owner: Int[np.ndarray, "f"], mesh: js.ControlMesh, valves: Sequence[str]
+        self,
+        topology: js.Topology,
+        surface: js.RefinedSurface,
+        owner: Int[np.ndarray, "f"],
+        mesh: js.ControlMesh,
+        valves: Sequence[str],
     ):
         regions = None if mesh.regions is None else js.Regions(mesh.regions.rows[owner], mesh.regions.names)
         refined = js.ControlMesh(surface.vertices, dict(surface.faces), check=False, regions=regions)
         self.parts: tuple[Part, ...] = find_parts(refined, valves)
-        self.triangles = refined_triangles(surface, np.ones(len(owner), bool))
-        self._tables = [
-            _PartTables(refined_triangles(surface, part.faces), tuple((rim, np.roll(rim, -1)) for rim in part.rims))
-            for part in self.parts
-        ]
+        self._whole = js.losses.surface_part(topology)
+        self._parts = [js.losses.surface_part(topology, part.faces) for part in self.parts]
         self.is_closed = refined.is_closed
         self.cavities = [i for i, part in enumerate(self.parts) if part.is_cavity]
         self.columns = self._columns()
@@ -90,25 +84,22 @@ class Measures:
         """The other side of the wall of every cavity."""
         found = []
         for i in self.cavities:
-            triangles = self._tables[i].triangles
-            vertices = np.unique(triangles)
+            vertices = np.unique(self._parts[i].triangles)
             others = np.any([part.faces for j, part in enumerate(self.parts) if j != i], axis=0)
             choice = js.FaceChoice(np.zeros(len(vertices), np.int32), others[None])
-            x = np.asarray(surface.vertices)
             at = closest_points(surface, surface.vertices[vertices], choice)
             corners, weights = js.corner_weights(surface, at)
-            areas = _vertex_areas(x, triangles)[vertices]
-            found.append(Walls(vertices, corners, weights, areas / areas.sum()))
+            found.append(Walls(vertices, corners, weights, _shares(surface, self._parts[i])[vertices]))
         return found
 
     def measure(self, surface: js.RefinedSurface, walls: Sequence[Walls]) -> Float[Array, "m"]:
         """The numbers of a surface, in the order of `columns`."""
         x = surface.vertices
-        found = [_ML * jnp.abs(_volume(x, self._tables[i])) for i in self._closed()]
+        found = [_ML * jnp.abs(js.losses.enclosed_volume(surface, part=self._parts[i])) for i in self._closed()]
         if self.is_closed:
-            whole = _ML * _volume(x, _PartTables(self.triangles, ()))
+            whole = _ML * js.losses.enclosed_volume(surface, part=self._whole)
             found += [whole, DENSITY * whole] if self.cavities else [whole]
-        found += [_CM2 * jnp.sum(_areas(x, tables.triangles)) for tables in self._tables]
+        found += [_CM2 * js.losses.surface_area(surface, part=part) for part in self._parts]
         for wall in walls:
             beyond = js.sum_corners(x, jnp.asarray(wall.corners), jnp.asarray(wall.corner_weights))
             found.append(jnp.sum(jnp.asarray(wall.shares, x.dtype) * norm(x[wall.vertices] - beyond)[:, 0]))
@@ -116,8 +107,7 @@ class Measures:
 
     def shares(self, surface: js.RefinedSurface) -> Float[np.ndarray, "v"]:
         """Of the area of a surface, those of its vertices."""
-        areas = _vertex_areas(np.asarray(surface.vertices), self.triangles)
-        return areas / areas.sum()
+        return _shares(surface, self._whole)
 
     def displacement(
         self, surface: js.RefinedSurface, first: js.RefinedSurface, shares: Float[np.ndarray, "v"]
@@ -127,30 +117,8 @@ class Measures:
         return jnp.sum(jnp.asarray(shares, away.dtype) * away)
 
 
-def refined_triangles(surface: js.RefinedSurface, faces: Any) -> Int[np.ndarray, "t 3"]:
-    """Some faces of a surface, quads cut in two."""
-    three, four = (np.asarray(surface.faces[size]) for size in (3, 4))
-    quads = four[faces[len(three) :]]
-    return np.concatenate([three[faces[: len(three)]], quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-
-
-def _volume(x: Float[Array, "v 3"], part: _PartTables) -> Float[Array, ""]:
-    """The signed volume, every opening closed by a fan about the middle of its rim."""
-    a, b, c = (x[part.triangles[:, i]] for i in range(3))
-    volume = jnp.sum(a * cross(b, c)) / 6
-    for rim, after in part.rims:
-        middle = jnp.broadcast_to(jnp.mean(x[rim], axis=0), (len(rim), 3))
-        volume = volume - jnp.sum(middle * cross(x[rim], x[after])) / 6
-    return volume
-
-
-def _areas(x: Float[Array, "v 3"], triangles: Int[np.ndarray, "t 3"]) -> Float[Array, "t"]:
-    a, b, c = (x[triangles[:, i]] for i in range(3))
-    return norm(cross(b - a, c - a))[:, 0] / 2
-
-
-def _vertex_areas(x: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]) -> Float[np.ndarray, "v"]:
-    """A third of the area of the triangles at every vertex."""
-    a, b, c = (x[triangles[:, i]] for i in range(3))
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
-    return np.bincount(triangles.ravel(), np.repeat(areas, 3), len(x))
+def _shares(surface: js.RefinedSurface, part: js.losses.SurfacePart) -> Float[np.ndarray, "v"]:
+    """Of the area of a part, those of the surface's vertices."""
+    faces = {3: part.triangles, 4: np.zeros((0, 4), np.int32)}
+    areas = np.asarray(js.RefinedSurface(surface.vertices, surface.normals, faces).vertex_areas(), np.float64)
+    return areas / areas.sum()

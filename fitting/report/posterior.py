@@ -18,7 +18,7 @@ from jaxsubdiv.linalg import unit
 
 from ..model.pairing import on_boundary
 from ..scan.closest_points import boundary_vertices
-from ..solve.elements import differentiate_across, face_corners, slopes_of_rows
+from ..solve.elements import differentiate_across, face_corners, slopes_of_rows, times_transposed
 from ..solve.strengths import neighbourhood_mean
 from .misfit import misfit_variances
 from .record import Fit
@@ -109,6 +109,21 @@ class Posterior:
         by = np.take_along_axis(along, structure.elements.seeds_of[owner][:, None], axis=2).astype(np.float64)
         blocks = self.factor.covariance_blocks(self._free_columns(structure.elements.columns[owner]))
         return np.einsum("pxd,pde,pye->pxy", by, blocks, by, optimize=True)
+
+    def covariance_of(self, gradients: Float[np.ndarray, "m v 3"]) -> Float[np.ndarray, "m m"]:
+        """Of numbers that depend on the surface, from their gradients by its vertices; without the misfit."""
+        structure, model = self.equations.structure, self.fit.model
+        elements = structure.elements
+        face = np.zeros(gradients.shape[1], np.int64)
+        face[structure.corners] = structure.patches.owner[:, None]
+        of_surface, sides = np.asarray(self.equations.found.of_surface), np.zeros((model.layout.n, len(gradients)))
+        for i, gradient in enumerate(gradients):
+            across = np.einsum("vxs,vx->vs", of_surface, gradient.astype(of_surface.dtype))
+            slopes = slopes_of_rows(elements, across, face)
+            sides[: elements.n, i] = times_transposed(elements, slopes, np.ones(len(face)), face)
+        active = np.concatenate([np.ones(structure.n, bool), self.fit.active])
+        sides *= (np.asarray(model.is_free) * active)[:, None]
+        return sides.T @ self.factor.solve(sides)
 
     def _control_variances(self) -> Float[np.ndarray, "v"]:
         """Of every control vertex along its normal."""

@@ -7,6 +7,9 @@ import math
 from jaxsubdiv.frames import AXES
 
 from ..finding import Finding, Pose
+from .fit_measures import Measure
+
+_RECORDS = "warnings", "measures"  # fields that hold named tuples, which `asdict` would write as lists
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,6 +87,7 @@ class Report:
         determined: about how many of these the scan determines, the rest being left to the priors.
         least_margin: the least `admissible_margin` of the control normals: the surface is smooth above 0.05, and folds
             below -0.2. None where the scheme does not look at normals.
+        measures: volume, area and so on, with standard deviations; empty where these were not asked for.
         crossing_triangles: how many triangles of the surface go through others of it, a quad being two; None where
             that was not asked for, or the extra `contact` is not installed.
         crossings_at: x, y, z in mm, the middle of the crossings; None where there are none.
@@ -125,6 +129,7 @@ class Report:
     n_unknowns: int
     determined: float
     least_margin: float | None
+    measures: list[Measure]
     crossing_triangles: int | None
     crossings_at: list[float] | None
     uncertainty_median: float | None
@@ -182,6 +187,7 @@ class Report:
             rows.append(("likeness to the template", f"{self.likeness:.2f}"))
         if self.least_margin is not None:
             rows.append(("least margin of a normal", f"{self.least_margin:+.2f}"))
+        rows += [(one.name, str(one)) for one in self.measures]
         if self.crossing_triangles is not None:
             where = ""
             if self.crossings_at is not None:
@@ -203,7 +209,8 @@ class Report:
     def as_dict(self) -> dict[str, object]:
         """The same as plain values."""
         pose = None if self.pose is None else self.pose._asdict()
-        return dataclasses.asdict(self) | {"pose": pose, "warnings": [one._asdict() for one in self.warnings]}
+        records: dict[str, object] = {name: [one._asdict() for one in getattr(self, name)] for name in _RECORDS}
+        return dataclasses.asdict(self) | {"pose": pose} | records
 
     def as_json(self) -> str:
         """The same as JSON text; refuses values that JSON does not have."""

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import math
 import os
+from collections.abc import Sequence
 from typing import final
 
 import numpy as np
@@ -21,6 +22,7 @@ from .at_level import SurfaceAtLevel
 from .coverage import distances_to_scan, weighted_quantile, worst_places
 from .evidence import gather_evidence
 from .findings import find_what_speaks_against
+from .fit_measures import Measure, measure_surface
 from .posterior import Posterior, Uncertainty
 from .record import Fit, choose_faces, look_at
 from .refit import Refit, make_refit
@@ -125,6 +127,21 @@ class FitResult:
         except ImportError:
             return None
 
+    def measures(self, valves: Sequence[str] | None = None) -> tuple[Measure, ...]:
+        """Volume, area, and of a wall its cavities, mass and thickness, each with its standard deviation.
+
+        Where the control mesh has groups that are valves, the parts between them are measured one by one: the volume of
+        each cavity, closed by a flat cap over every opening, and the thickness of the wall around it. The volume of an
+        open surface is that under such caps.
+
+        Args:
+            valves: the groups that close the openings of cavities; default: those whose names say so.
+
+        Raises:
+            ValueError: a group is none of the control mesh.
+        """
+        return measure_surface(self.posterior, self.control_mesh, valves)
+
     @functools.cached_property
     def control_mesh(self) -> js.ControlMesh:
         """The fitted control mesh with its normals, for `js.write_mesh`."""
@@ -190,8 +207,8 @@ class FitResult:
         """The fit in numbers: `print` it, or take `.as_dict()`.
 
         Args:
-            uncertainty: with that of the surface, and with the triangles that cross others, which takes a second or
-                more.
+            uncertainty: with that of the surface, with `measures`, and with the triangles that cross others, which
+                takes a second or more.
         """
         areas, to_scan = self._seen_from_the_scan
         covered = ~np.isnan(to_scan)
@@ -234,6 +251,7 @@ class FitResult:
             least_margin=float(js.admissible_margin(self.control_mesh).min()) if self.scheme.uses_normals else None,
             crossing_triangles=None if crossings is None else len(crossings.triangles),
             crossings_at=np.median(crossings.places, axis=0).tolist() if crossings and len(crossings.places) else None,
+            measures=list(self.measures()) if uncertainty else [],
             uncertainty_median=None if spread is None else weighted_quantile(spread, share, 0.5),
             uncertainty_95=None if spread is None else weighted_quantile(spread, share, 0.95),
             shifts=[SliceShift(int(i), shift.tolist()) for i, shift in zip(self.slices, self.shifts, strict=True)],

@@ -119,7 +119,7 @@ class SeriesFit:
         """What is measured of every frame."""
         surface = self.surface(0)
         owner = js.control_faces_of(self.result.scheme, self._topology, surface, self.control(0))
-        return Measures(surface, owner, self.template, self.valves)
+        return Measures(self._topology, surface, owner, self.template, self.valves)
 
     @functools.cached_property
     def table(self) -> SeriesTable:
