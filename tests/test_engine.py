@@ -31,8 +31,10 @@ from fitting.model.priors import REGISTER
 from fitting.model.priors.boundary import BoundaryCurve
 from fitting.model.priors.landmarks import anchor_landmarks
 from fitting.model.priors.shifts import SlicePlanes
+from fitting.model.priors.valves import ValvePoints
 from fitting.model.procrustes import align_shape
 from fitting.run.fit import sound_start
+from fitting.scan.frames import Frames
 from fitting.solve import sweeps
 from fitting.solve.conjugate_gradients import ConjugateGradients
 from fitting.solve.strengths import FromScan, first_strengths
@@ -292,7 +294,11 @@ def derivatives() -> tuple[dict, dict, dict, dict]:
         "boundary": BoundaryCurve(np.asarray(start.vertices)[:5] + rng.normal(size=(5, 3)), 0.5),
         "symmetry": find_symmetry(mesh),
         "slices": SlicePlanes(np.arange(2), np.tile(np.eye(3)[:2], (2, 1, 1))),
+        "frames": Frames(rng.normal(size=(3, 3)), np.ones(3, int), True),
     }
+    upper, lower = np.array([True, True, False, False]), np.array([False, False, True, True])
+    slices = np.array([0, 1, -1])
+    inputs["valves"] = ValvePoints(rng.normal(size=(3, 3)), slices, np.zeros(3, int), upper[None], lower)
     model, y = analysed(scheme, topology, control, priors=Priors(shape=family, symmetry=1.0), **inputs)
     assert [prior.name for prior in model.priors] == [kind.name for kind in REGISTER]
     held = model.hold(model.place(y, model.refine(y)), first_strengths(model).values | {"likeness": jnp.asarray(0.5)})

@@ -15,9 +15,9 @@ from ..scan.scan import Scan
 from .fit import fit
 
 # A start that is the fit of the pilot's own scan is expected to return bit by bit, noise included: the scan is found
-# to be as like the start as can be, and the deviations that are left are those of the sweeps, not of anatomy. A start
-# may have had another h, so that its distances fall a little.
-_LIKE, _HARDLY_FELL, _NOTHING_LEFT = 0.5, 2.2, 0.02  # the last in control edges
+# to be as like the start as can be, and the deviations that are left are those of the sweeps, not of anatomy. Of such
+# starts half of the surface moved by less than 0.4 of the noise, of templates by more than 0.6 in all cases tried.
+_LIKE, _HARDLY_MOVED, _NOTHING_LEFT = 0.5, 0.5, 0.03  # the last in control edges
 
 
 def make_pilot(
@@ -48,7 +48,7 @@ def make_pilot(
         return fit(scheme, topology, controls[i], scans[i], throw=False, **(settings | of_each[i] | other))
 
     pilot = fit_one(0) if given is None else given
-    if not is_its_own_start(pilot):
+    if settings["priors"].likeness is not None or not is_its_own_start(pilot):
         return pilot
     if len(scans) == 1:
         other = fit_one(0, priors=dataclasses.replace(settings["priors"], likeness=0.0))
@@ -67,11 +67,15 @@ def make_pilot(
 
 def is_its_own_start(pilot: FitResult) -> bool:
     """Whether a fit started from a surface that was fitted to the same scan, and expected that surface again."""
-    values = pilot.fit.strengths.values
-    edge = float(js.edge_length(pilot.fit.topology, pilot.control.vertices))
+    values, topology = pilot.fit.strengths.values, pilot.fit.topology
     usual = float(np.median(np.asarray(values["bend"], np.float64))) ** -0.5
-    expected = float(values["likeness"]) > _LIKE and usual < _NOTHING_LEFT * edge
-    return expected and bool(pilot.robust_rms[0] < _HARDLY_FELL * pilot.robust_rms[-1])
+    if float(values["likeness"]) < _LIKE or usual > _NOTHING_LEFT * float(
+        js.edge_length(topology, pilot.start.vertices)
+    ):
+        return False
+    before = np.asarray(js.refine(pilot.scheme, topology, pilot.start).vertices)  # with the h that was found
+    moved = np.einsum("vx,vx->v", np.asarray(pilot.surface.vertices) - before, np.asarray(pilot.surface.normals))
+    return bool(np.median(np.abs(moved)) < _HARDLY_MOVED * pilot.noise)
 
 
 def _distance(scheme: js.AbstractScheme, topology: js.Topology, control: js.Control, scan: Scan) -> float:
