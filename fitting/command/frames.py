@@ -15,10 +15,10 @@ from ..run.recipe import Recipe
 from ..run.series import fit_series
 from .inputs import Source, read_inputs
 from .messages import print_regions, print_warnings, report_failure
+from .one import REFUSALS
 from .progress import Progress
 
 _FRAMES = "frames"
-_REFUSALS = (js.MeshError, ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError)
 # Options that a series has no use for, and their values where they are not given.
 _UNUSED = {"tolerance": None, "points": None, "boundary": None, "landmarks": None, "carry": None, "mirror": False}
 _UNUSED |= {"resume": False, "symmetry": None, "prior": None, "template_out": None}
@@ -33,7 +33,7 @@ def fit_frames(scans: list[Source], options: argparse.Namespace, recipe: Recipe)
                 raise ValueError(f"--{name.replace('_', '-')} is not of a series: leave it out.")
         with working_in(folder):
             return _fit_and_save(scans, folder, options, recipe)
-    except _REFUSALS as error:
+    except REFUSALS as error:
         return report_failure(error)
 
 

@@ -58,6 +58,10 @@ def _main(arguments: Sequence[str] | None) -> int:
         folder = Path(options.output or (name_folder(scan.as_file) if scan else f"fit_{options.example}"))
         return fit_one(scan, folder, options, recipe, scan.title() if scan else options.example)["status"]
     except KeyboardInterrupt:
-        skips = "; with --resume it skips the scans that are done" if len(scans) > 1 else ""
-        print(f"\nstopped  the same command goes on from the last sweep{skips}", file=sys.stderr)
+        again = "the same command goes on from the last sweep"
+        if options.series or options.template_out:
+            again = "the same command begins anew"
+        elif len(scans) > 1:
+            again += "; with --resume it skips the scans that are done"
+        print(f"\nstopped  {again}", file=sys.stderr)
         return 130
