@@ -75,8 +75,7 @@ class Posterior:
         """Of every vertex of the surface along its normal."""
         structure, normals = self.equations.structure, np.asarray(self.fit.surface().normals)
         across = np.einsum("vxs,vx->vs", np.asarray(self.equations.found.of_surface), normals)
-        face = np.zeros(len(normals), np.int64)
-        face[structure.corners] = structure.patches.owner[:, None]
+        face = structure.faces_of_vertices(len(normals))
         return self._variances(face, lambda rows: slopes_of_rows(structure.elements, across[rows], face[rows]))
 
     def _variances(
@@ -112,18 +111,25 @@ class Posterior:
 
     def covariance_of(self, gradients: Float[np.ndarray, "m v 3"]) -> Float[np.ndarray, "m m"]:
         """Of numbers that depend on the surface, from their gradients by its vertices; without the misfit."""
-        structure, model = self.equations.structure, self.fit.model
-        elements = structure.elements
-        face = np.zeros(gradients.shape[1], np.int64)
-        face[structure.corners] = structure.patches.owner[:, None]
-        of_surface, sides = np.asarray(self.equations.found.of_surface), np.zeros((model.layout.n, len(gradients)))
+        elements, of_surface = self.equations.structure.elements, np.asarray(self.equations.found.of_surface)
+        face = self.equations.structure.faces_of_vertices(len(of_surface))
+        sides = np.zeros((self.fit.model.layout.n, len(gradients)))
         for i, gradient in enumerate(gradients):
             across = np.einsum("vxs,vx->vs", of_surface, gradient.astype(of_surface.dtype))
             slopes = slopes_of_rows(elements, across, face)
             sides[: elements.n, i] = times_transposed(elements, slopes, np.ones(len(face)), face)
-        active = np.concatenate([np.ones(structure.n, bool), self.fit.active])
-        sides *= (np.asarray(model.is_free) * active)[:, None]
-        return sides.T @ self.factor.solve(sides)
+        return self.covariance_by_unknowns(sides)
+
+    def covariance_by_unknowns(self, derivatives: Float[np.ndarray, "u m"]) -> Float[np.ndarray, "m m"]:
+        """Of numbers, from their derivatives by all unknowns; see `Layout` for their order."""
+        free = self._is_free * derivatives
+        return free.T @ self.factor.solve(free)
+
+    @property
+    def _is_free(self) -> Float[np.ndarray, "u 1"]:
+        """1 for unknowns that the fit was free to change, else 0."""
+        active = np.concatenate([np.ones(self.equations.structure.n, bool), self.fit.active])
+        return (np.asarray(self.fit.model.is_free) * active)[:, None]
 
     def _control_variances(self) -> Float[np.ndarray, "v"]:
         """Of every control vertex along its normal."""
@@ -162,8 +168,7 @@ class Posterior:
         """Random offsets of the unknowns, as probable as the posterior has them; see `Layout` for their order."""
         size = self.fit.model.layout.n
         drawn = self.factor.sample(np.random.default_rng(seed).normal(size=(size, n)))
-        active = np.concatenate([np.ones(self.equations.structure.n, bool), self.fit.active])
-        return drawn * (np.asarray(self.fit.model.is_free) * active)[:, None]
+        return drawn * self._is_free
 
 
 def _at_vertices(

@@ -103,10 +103,7 @@ def measure_series(
 
     def refine(vector: Float[Array, "n"], y: Variables) -> js.RefinedSurface:
         moved = own.retract(y, own.split(vector), edge)
-        scheme = (
-            result.scheme if "h" not in moved.shared else eqx.tree_at(lambda s: s.h, result.scheme, moved.shared["h"])
-        )
-        return js.refine(scheme, topology, moved.control)
+        return js.refine(fit.model.scheme_at(moved), topology, moved.control)
 
     def of_frame(vector: Float[Array, "n"], y: Variables, walls: list[Walls]) -> Float[Array, "m"]:
         return measures.measure(refine(vector, y), walls)
@@ -139,10 +136,7 @@ def measure_series(
         values.append([*found, float(away)])
         sides.append(np.concatenate([by, place(by_both[:1], k) + place(by_both[1:], 0)], axis=1))
     values = np.array(values)
-    derivatives = np.concatenate(sides, axis=1)
-    free = np.asarray(fit.model.is_free) * np.append(np.ones(layout.n_own), fit.active)
-    derivatives *= free[:, None]
-    covariance = derivatives.T @ result.posterior.factor.solve(derivatives)
+    covariance = result.posterior.covariance_by_unknowns(np.concatenate(sides, axis=1))
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0)).reshape(n, m + 1)
     columns = (*measures.columns, Column("displacement", "mm"))
     ejection = {}

@@ -195,8 +195,7 @@ class SparseEquations:
 
     def _add_distances(self) -> Arrowhead:
         """The scan's matrix; its gradient is added to that of all."""
-        structure, held, n = self.structure, self.held, self.structure.n
-        elements, n_h = structure.elements, structure.elements.n - n
+        structure, held = self.structure, self.held
         weights = np.asarray(held.distance_precisions, np.float64)
         distances = np.asarray(_measure_distances(self.found.surface, held.pairs), np.float64)
         self.values["distance"] = distances
@@ -204,19 +203,10 @@ class SparseEquations:
         weighed = sp.csr_array(sp.diags_array(weights) @ by_shifts)
         sides = sp.csr_array(sp.hstack([(weights * distances)[:, None], weighed]))
         matrix, across = self._multiply_distances(weights, sides)
-        self.gradient[: elements.n] += across[:, 0]
+        self.gradient[: structure.elements.n] += across[:, 0]
         found = structure.arrange(matrix, self._n_shared)
-        if held.of_points is None:
-            return found
-        # How the shifts of slices and the other unknowns move distances together.
-        across = across[:, 1:]
-        columns = self.model.layout.columns("shifts")
-        shifts = slice(columns.start - n, columns.stop - n)
-        found.border[:, shifts] += across[:n]
-        found.corner[:n_h, shifts] += across[n:]
-        found.corner[shifts, :n_h] += across[n:].T
-        found.corner[shifts, shifts] += (by_shifts.T @ weighed).toarray()
-        self.gradient[columns] += weighed.T @ distances
+        if held.of_points is not None:
+            self._couple_shifts(found, across[:, 1:], by_shifts, weighed, distances)
         return found
 
     def _multiply_distances(
@@ -265,25 +255,31 @@ class SparseEquations:
             by_shifts = prior.by_shifts(held.priors[prior.name])
             if by_shifts is not None and "shifts" in dict(self.model.layout.shared):
                 own = self._rows_of[prior.name]
-                self._couple_shifts(found, self.jacobian(prior.name), by_shifts, weights[own], rows[own])
+                weighed = sp.csr_array(sp.diags_array(weights[own]) @ by_shifts)
+                across = (self.jacobian(prior.name).T @ weighed).toarray()[: elements.n]
+                self._couple_shifts(found, across, by_shifts, weighed, rows[own])
         return found
 
     def _couple_shifts(
         self,
         matrix: Arrowhead,
-        by_own: sp.csr_array,
+        across: Float[np.ndarray, "e k"],
         by_shifts: sp.csr_array,
-        weights: Float[np.ndarray, "m"],
+        weighed: sp.csr_array,
         rows: Float[np.ndarray, "m"],
     ) -> None:
-        """Add to a matrix, and to the gradient, how shifts move the rows of a prior, by themselves and with others."""
+        """Add to a matrix, and to the gradient, how shifts move rows, by themselves and with the other unknowns.
+
+        Args:
+            across: J' W S, of the unknowns of the elements.
+            by_shifts: S, the derivatives of the rows by the shifts.
+            weighed: W S.
+        """
         n, columns = self.structure.n, self.model.layout.columns("shifts")
-        shifts = slice(columns.start - n, columns.stop - n)
-        weighed = sp.csr_array(sp.diags_array(weights) @ by_shifts)
-        across = (by_own.T @ weighed).toarray()
+        shifts, lengths = slice(columns.start - n, columns.stop - n), slice(len(across) - n)
         matrix.border[:, shifts] += across[:n]
-        matrix.corner[:, shifts] += across[n:]
-        matrix.corner[shifts] += across[n:].T
+        matrix.corner[lengths, shifts] += across[n:]
+        matrix.corner[shifts, lengths] += across[n:].T
         matrix.corner[shifts, shifts] += (by_shifts.T @ weighed).toarray()
         self.gradient[columns] += weighed.T @ rows
 

@@ -73,6 +73,12 @@ class Structure:
         patches = self.patches
         return patches.vertices[patches.owner[:, None], patches.slots]
 
+    def faces_of_vertices(self, n: int) -> Int[np.ndarray, "n"]:
+        """A control face that each of the `n` vertices of the surface lies in."""
+        faces = np.zeros(n, np.int64)
+        faces[self.corners] = self.patches.owner[:, None]
+        return faces
+
     def arrange(self, values: Float[np.ndarray, "_"], n_shared: int) -> Arrowhead:
         """The arrowhead of values in the pattern of the elements, in which h stands after the unknowns of vertices."""
         of_elements, n = self.elements.pattern, self.n

@@ -50,7 +50,7 @@ def find_parts(mesh: js.ControlMesh, valves: Sequence[str]) -> tuple[Part, ...]:
     inside = kept[sides.face]
     pairs = np.stack([sides.face[inside], mesh.n_faces + sides.edge[inside]], axis=1)
     labels = component_labels(pairs, mesh.n_faces + len(sides.edges))[: mesh.n_faces]
-    found = []
+    found, is_closed = [], mesh.is_closed
     for label in np.unique(labels[kept]):
         faces = kept & (labels == label)
         own = faces[sides.face]
@@ -58,15 +58,9 @@ def find_parts(mesh: js.ControlMesh, valves: Sequence[str]) -> tuple[Part, ...]:
         rims = _loops(sides.start[alone], sides.end[alone])
         names = [name for name in dict.fromkeys(words[faces].tolist()) if name]
         volume = _closed_volume(mesh, faces, rims)
-        found.append(
-            Part("+".join(names) or "surface", faces, bool(rims) and not mesh_is_open(mesh) and volume < 0, rims)
-        )
+        is_cavity = bool(rims) and is_closed and volume < 0  # an open mesh bounds no wall
+        found.append(Part("+".join(names) or "surface", faces, is_cavity, rims))
     return tuple(found)
-
-
-def mesh_is_open(mesh: js.ControlMesh) -> bool:
-    """Whether a mesh has a boundary: it bounds no wall."""
-    return not mesh.is_closed
 
 
 def _loops(start: Int[np.ndarray, "s"], end: Int[np.ndarray, "s"]) -> tuple[Int[np.ndarray, "_"], ...]:
