@@ -9,7 +9,7 @@ from ._normals import fan_normals
 from ._scheme.base import AbstractScheme
 from ._surface import RefinedSurface
 from ._topology import Level, LimitMasks, Topology
-from .linalg import cross, largest, unit, unit_or
+from .linalg import cross, max_abs, unit, unit_or
 
 
 def refine(scheme: AbstractScheme, topology: Topology, control: Control) -> RefinedSurface:
@@ -79,7 +79,7 @@ def _refine(
         recompute = scheme.recomputes_normals or (topology.mesh_normals and last)
         x, n = scheme.refine_level(h if h is None or h.ndim == 0 else h[i], level, x, n, recompute)
     if topology.limit is not None:
-        x, n = _at_limit(topology, topology.limit, x, scheme)
+        x, n = _move_to_limit(topology, topology.limit, x, scheme)
     elif topology.fans is not None:
         n = fan_normals(topology.fans, x, x, jnp.zeros_like(x), scheme.weights)
     if not scheme.interpolates:
@@ -96,7 +96,7 @@ def _middle(topology: Topology, x: Float[Array, "v 3"]) -> Float[Array, "1 3"]:
     return jnp.sum(jnp.where(real, x, 0.0), axis=0, keepdims=True) / jnp.sum(real).astype(x.dtype)
 
 
-def _at_limit(
+def _move_to_limit(
     topology: Topology, limit: LimitMasks, x: Float[Array, "w 3"], scheme: AbstractScheme
 ) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
     """Every vertex in its place on the limit surface, and the normal there; that of the mesh where it has none."""
@@ -106,7 +106,7 @@ def _at_limit(
     if limit.tangents is None:
         return points, n
     first, second = (tangent(x) for tangent in limit.tangents)
-    rounding = 16 * jnp.finfo(x.dtype).eps * largest(first) * largest(second)
+    rounding = 16 * jnp.finfo(x.dtype).eps * max_abs(first) * max_abs(second)
     return points, unit_or(cross(first, second), n, rounding)
 
 
