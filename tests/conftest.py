@@ -29,7 +29,8 @@ _LONGEST = (
     "test_likeness",
     "test_engine",
     "test_fit",
-    "test_commands",
+    "test_command_fit",
+    "test_command_endings",
 )
 
 
