@@ -28,7 +28,9 @@ from .progress import Progress
 REFUSALS = (js.MeshError, ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError)
 
 
-def fit_one(scan: Source | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str) -> dict[str, Any]:
+def fit_one(
+    scan: Source | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str
+) -> dict[str, Any]:
     """One fit: its row of the summary, whose status is 0, 1 for one not to be trusted, 2 for one that failed."""
     title, began = make_printable(title), time.perf_counter()
     try:
@@ -42,7 +44,9 @@ def fit_one(scan: Source | None, folder: Path, options: argparse.Namespace, reci
     return {"scan": title, "status": status, "seconds": f"{time.perf_counter() - began:.1f}"}
 
 
-def _fit_and_save(scan: Source | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str) -> dict[str, Any]:
+def _fit_and_save(
+    scan: Source | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str
+) -> dict[str, Any]:
     began = time.perf_counter()
     job = read_inputs(scan, options, recipe)
     slices = "" if job.scan.slices is None else f" in {len(np.unique(job.scan.slices))} slices"
