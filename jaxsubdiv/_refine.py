@@ -10,7 +10,7 @@ from ._normals import fan_normals
 from ._scheme.base import AbstractScheme
 from ._surface import RefinedSurface
 from ._topology import Level, LimitMasks, Topology
-from .linalg import cross, largest, unit, unit_or
+from .linalg import cross, max_abs, unit, unit_or
 
 
 def refine(scheme: AbstractScheme, topology: Topology, control: Control) -> RefinedSurface:
@@ -76,7 +76,7 @@ def refine_levels(scheme: AbstractScheme, topology: Topology, control: Control) 
     _check(scheme, topology, control)
     faces = faces_of_levels(topology)
     found = _refine_levels(scheme, topology, control)
-    return tuple(RefinedSurface(*rows, of_level) for rows, of_level in zip(found, faces, strict=True))
+    return tuple(RefinedSurface(x, n, of_level) for (x, n), of_level in zip(found, faces, strict=True))
 
 
 @jax.jit
@@ -100,7 +100,7 @@ def _refine(
     origin, levels = _split_levels(scheme, topology, control)
     x, n = levels[-1]
     if topology.limit is not None:
-        x, n = _at_limit(topology, topology.limit, x, scheme)
+        x, n = _move_to_limit(topology, topology.limit, x, scheme)
     elif topology.fans is not None:
         n = fan_normals(topology.fans, x, x, jnp.zeros_like(x), scheme.weights)
     if not scheme.interpolates:
@@ -133,7 +133,7 @@ def _middle(topology: Topology, x: Float[Array, "v 3"]) -> Float[Array, "1 3"]:
     return jnp.sum(jnp.where(real, x, 0.0), axis=0, keepdims=True) / jnp.sum(real).astype(x.dtype)
 
 
-def _at_limit(
+def _move_to_limit(
     topology: Topology, limit: LimitMasks, x: Float[Array, "w 3"], scheme: AbstractScheme
 ) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
     """Every vertex in its place on the limit surface, and the normal there; that of the mesh where it has none."""
@@ -143,7 +143,7 @@ def _at_limit(
     if limit.tangents is None:
         return points, n
     first, second = (tangent(x) for tangent in limit.tangents)
-    rounding = 16 * jnp.finfo(x.dtype).eps * largest(first) * largest(second)
+    rounding = 16 * jnp.finfo(x.dtype).eps * max_abs(first) * max_abs(second)
     return points, unit_or(cross(first, second), n, rounding)
 
 

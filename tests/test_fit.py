@@ -163,7 +163,7 @@ def test_rows_have_finite_derivatives_at_a_perfect_fit():
     model, y = analysed(scheme, topology, control)
     pairs = two_points()._replace(points=jnp.array([(0.75, 1.0, 0.0), (3.0, 0.0, 0.0)]))
     held = hold_everything(model, y, pairs, np.zeros(2, int))
-    of_offsets = Residual(model).about(y)
+    of_offsets = Residual(model).recentre(y)
     by = jax.jacfwd(of_offsets)(of_offsets.zero, held)
     assert np.allclose(Residual(model).rows(y, held)["distance"], 0)
     assert all(np.isfinite(part).all() for part in jax.tree.leaves(by))

@@ -58,7 +58,7 @@ def mixed_rows(kind: str, levels: int):
             np.random.default_rng(len(row)).uniform(0.5, 2, len(row)) if name != "distance" else precisions[name]
         )
     held = held._replace(distance_precisions=precisions.pop("distance"), precisions=precisions)
-    of_offsets, split = Residual(model).about(y), model.layout.split
+    of_offsets, split = Residual(model).recentre(y), model.layout.split
 
     @jax.jit
     def in_full(vector):

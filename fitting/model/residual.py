@@ -53,9 +53,9 @@ class Model(eqx.Module):
         """The prior of a name, where it is in force."""
         return next((prior for prior in self.priors if prior.name == name), None)
 
-    def bare(self) -> "Model":
+    def strip_strengths(self) -> "Model":
         """The model without what its rows do not depend on."""
-        return dataclasses.replace(self, priors=tuple(prior.bare() for prior in self.priors))
+        return dataclasses.replace(self, priors=tuple(prior.strip_strengths() for prior in self.priors))
 
     @property
     def face_priors(self) -> list[AbstractFacePrior]:
@@ -86,7 +86,7 @@ class Model(eqx.Module):
         """The same with the surface; see `Place.before`."""
         scheme, topology = self.scheme_at(y), self.topology
         keeps_normals = scheme.uses_normals and not scheme.recomputes_normals and not topology.mesh_normals
-        if not keeps_normals:
+        if not keeps_normals or topology.real is not None:
             return self.place(y, self.refine(y))
         *_, before, surface = js.refine_levels(scheme, topology, y.control)
         return self.place(y, surface)._replace(before=before)
@@ -95,7 +95,7 @@ class Model(eqx.Module):
         """The variables with an offset put on."""
         return self.layout.retract(y, offset, js.edge_length(self.topology, y.control.vertices))
 
-    def lasting(self, y: Variables) -> Variables:
+    def keep_lasting(self, y: Variables) -> Variables:
         """The variables without the unknowns that only let a step move along with them."""
         kept = {name: y.shared[name] for name, of in self.layout.shared if of.lasting}
         return Variables(y.control, kept)
@@ -126,8 +126,8 @@ class Held(NamedTuple):
 class Residual(eqx.Module):
     """The rows of a fit over their standard deviations, for any least-squares solver of optimistix.
 
-    `residual(y, held)` takes `Variables` and what a sweep holds fixed. `residual.about(y)` is the same as a function of
-    offsets (`Unknowns`) from `y`, each scaled to about 1 mm, in which normals have two coordinates: that is what
+    `residual(y, held)` takes `Variables` and what a sweep holds fixed. `residual.recentre(y)` is the same as a function
+    of offsets (`Unknowns`) from `y`, each scaled to about 1 mm, in which normals have two coordinates: that is what
     `optx.LevenbergMarquardt` and `optx.GaussNewton` solve best.
     """
 
@@ -153,9 +153,9 @@ class Residual(eqx.Module):
         if held.of_points is None or held.shifts is None:
             return distances
         change = (place.shared["shifts"] - held.shifts).astype(distances.dtype)
-        return distances - self.along_shifts(held, change)
+        return distances - self.project_shifts(held, change)
 
-    def along_shifts(self, held: Held, shifts: Float[Array, "s 2"]) -> Float[Array, "p"]:
+    def project_shifts(self, held: Held, shifts: Float[Array, "s 2"]) -> Float[Array, "p"]:
         """How far shifts of slices move each point along its direction."""
         prior = self.model.prior("shift")
         assert isinstance(prior, ShiftPrior) and held.of_points is not None
@@ -163,7 +163,7 @@ class Residual(eqx.Module):
         moved = jnp.sum(shifts[:, :, None] * planes, axis=1)[jnp.maximum(held.of_points, 0)]
         return jnp.where(held.of_points >= 0, dot(held.pairs.directions, moved)[:, 0], 0.0)
 
-    def about(self, y: Variables) -> "OffsetResidual":
+    def recentre(self, y: Variables) -> "OffsetResidual":
         """The same as a function of offsets from `y`."""
         return OffsetResidual(self, y)
 
@@ -217,7 +217,7 @@ def analyse(
     owner = js.control_faces_of(scheme, topology, surface, control)
     start = Start(scheme, topology, control, surface, owner, has_normals, has_h, inputs)
     made = [prior for kind in REGISTER if (prior := kind.make(priors, start)) is not None]
-    shared = {name: of for prior in made for name, of in prior.shared().items()}
+    shared = {name: of for prior in made for name, of in prior.shared_unknowns().items()}
     layout = Layout(n_vertices, has_vertices, has_normals, tuple(shared.items()))
     rows = [
         np.repeat(np.asarray(masks[name])[:, None], width, axis=1)
@@ -226,7 +226,7 @@ def analyse(
     ]
     own = np.concatenate(rows, axis=1).ravel() if rows else np.zeros(0)
     is_free = np.concatenate([own, np.ones(layout.n - layout.n_own)]).astype(float)
-    values = {name: value for prior in made for name, value in prior.initial().items()}
+    values = {name: value for prior in made for name, value in prior.initial_values().items()}
     edge = jnp.asarray(js.edge_length(topology, control.vertices))
     model = Model(scheme, topology, tuple(made), layout, is_free, control.vertices, edge)
     return model, Variables(control, values)

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 import jaxsubdiv as js
 from jaxsubdiv.linalg import unit
 
-from ..model.pairing import on_boundary
+from ..model.pairing import is_on_boundary
 from ..scan.closest_points import boundary_vertices
 from ..solve.derivatives import differentiate_across
 from ..solve.elements import face_corners, slopes_of_rows, times_transposed
@@ -44,7 +44,7 @@ class Posterior:
     def __init__(self, fit: Fit):
         self.fit = fit
         self.equations = fit.equations()
-        matrix = self.equations.data.plus(self.equations.prior)
+        matrix = self.equations.data.add(self.equations.prior)
         self.factor = self.equations.factorise(matrix, fit.loose, fit.active)
 
     def uncertainty(self) -> Uncertainty:
@@ -56,7 +56,7 @@ class Posterior:
         structure = self.equations.structure
         of_control, of_surface = self._control_variances(), self._surface_variances
         patches = structure.patches
-        misfit = _at_vertices(self._misfit_of_faces, patches.corners, patches.owner, len(of_surface))
+        misfit = _average_corners(self._misfit_of_faces, patches.corners, patches.owner, len(of_surface))
         return Uncertainty(np.sqrt(of_control), np.sqrt(of_surface + misfit), np.sqrt(misfit))
 
     def deviations_of(self, topology: js.Topology) -> Float[np.ndarray, "w"]:
@@ -70,7 +70,7 @@ class Posterior:
         face[corners] = owner[:, None]
         across = np.asarray(differentiate_across(model, fit.y, elements.seeds, surface.normals))
         variances = self._variances(face, lambda rows: slopes_of_rows(elements, across[:, rows], face[rows]))
-        return np.sqrt(variances + _at_vertices(self._misfit_of_faces, corners, owner, len(variances)))
+        return np.sqrt(variances + _average_corners(self._misfit_of_faces, corners, owner, len(variances)))
 
     @functools.cached_property
     def _surface_variances(self) -> Float[np.ndarray, "w"]:
@@ -156,7 +156,7 @@ class Posterior:
         owner = structure.patches.owner
         pairs, open_vertices = look.pairs, boundary_vertices(surface)
         # Where a surface ends, distances run along it.
-        counted = ~np.asarray(on_boundary(open_vertices, pairs.corners, pairs.corner_weights))
+        counted = ~np.asarray(is_on_boundary(open_vertices, pairs.corners, pairs.corner_weights))
         at_points = np.sum(np.asarray(pairs.corner_weights, np.float64) * variances[np.asarray(pairs.corners)], axis=1)
         weights = np.asarray(look.precisions, np.float64) * counted
         distances, face = np.asarray(look.distances, np.float64), np.asarray(look.at.face)
@@ -173,7 +173,7 @@ class Posterior:
         return drawn * self._is_free
 
 
-def _at_vertices(
+def _average_corners(
     of_faces: Float[np.ndarray, "f"], corners: Int[np.ndarray, "g 4"], owner: Int[np.ndarray, "g"], n: int
 ) -> Float[np.ndarray, "n"]:
     """Of the vertices of a surface, means of the control faces that they lie on."""

@@ -107,7 +107,7 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> Structur
     Raises:
         ValueError: a face of the scheme depends on too many control vertices.
     """
-    model = model.bare()
+    model = model.strip_strengths()
     surface = model.refine(y)
     owner = js.control_faces_of(model.scheme, model.topology, surface, y.control)
     patches = find_patches(surface.faces, owner, model.topology.n_control_faces)
@@ -129,10 +129,10 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> Structur
     near = None
     for one in sorted(tied, key=lambda one: one.is_distant):
         if one.is_distant and near is None:
-            near = _sorted(pattern)
+            near = _sort(pattern)
         by = sparse_rows(np.ones(one.columns.shape), one.columns, layout.n)
         pattern = pattern + abs(sp.csc_array((by.T @ by)[:n, :n]))
-    pattern = _sorted(pattern)
+    pattern = _sort(pattern)
     keys, column = _keys(pattern), _columns(pattern)
     of_elements = elements.pattern
     source = np.flatnonzero((of_elements.indices < n) & (_columns(of_elements) < n))
@@ -190,7 +190,7 @@ def sparse_rows(by: Float[np.ndarray, "m d"], columns: Int[np.ndarray, "m d"], n
     return sp.csr_array(table[:, :n])
 
 
-def _sorted(pattern: sp.sparray) -> sp.csc_array:
+def _sort(pattern: sp.sparray) -> sp.csc_array:
     sorted_pattern = sp.csc_array(pattern)
     sorted_pattern.sort_indices()
     return sorted_pattern

@@ -86,11 +86,11 @@ class AbstractPrior(eqx.Module):
         """The prior with its tables, built in numpy; it may raise."""
         raise NotImplementedError
 
-    def shared(self) -> dict[str, Shared]:
+    def shared_unknowns(self) -> dict[str, Shared]:
         """The unknowns that the prior brings along, which all rows share."""
         return {}
 
-    def initial(self) -> dict[str, Array]:
+    def initial_values(self) -> dict[str, Array]:
         """Values of those that last, where the fit starts."""
         return {}
 
@@ -106,7 +106,7 @@ class AbstractPrior(eqx.Module):
         """1 / variance of the rows: an array of them, or one for all."""
         raise NotImplementedError
 
-    def bare(self) -> "AbstractPrior":
+    def strip_strengths(self) -> "AbstractPrior":
         """The prior without what only its strengths depend on: whether those are given or found, one compiled program
         has its rows."""
         return self
@@ -136,7 +136,7 @@ class AbstractFacePrior(AbstractPrior):
         """The control face of every row."""
         raise NotImplementedError
 
-    def by_shifts(self, held: Any) -> sp.csr_array | None:
+    def differentiate_shifts(self, held: Any) -> sp.csr_array | None:
         """Derivatives of the rows by the shifts of slices, two a slice; None where there are none."""
         return None
 
