@@ -22,7 +22,7 @@ from fitting.__main__ import main as fitting_command
 from fitting.model.priors.bend import bend_asymmetry
 from fitting.model.residual import Model, Pairs
 from fitting.model.unknowns import Unknowns, Variables, tangents
-from fitting.solve.elements import differentiate
+from fitting.solve.derivatives import differentiate
 from fitting.solve.sparse_normal import SparseEquations
 
 LOOSE = Priors(bend=10.0, stretch=10.0, h=10.0)

@@ -82,6 +82,15 @@ class Model(eqx.Module):
         values = self.scheme_at(y), self.topology, y.control, missing | y.shared
         return Place(*values, surface, self.template, self.edge)
 
+    def place_of(self, y: Variables) -> Place:
+        """The same with the surface; see `Place.before`."""
+        scheme, topology = self.scheme_at(y), self.topology
+        keeps_normals = scheme.uses_normals and not scheme.recomputes_normals and not topology.mesh_normals
+        if not keeps_normals or topology.real is not None:
+            return self.place(y, self.refine(y))
+        *_, before, surface = js.refine_levels(scheme, topology, y.control)
+        return self.place(y, surface)._replace(before=before)
+
     def retract(self, y: Variables, offset: Unknowns) -> Variables:
         """The variables with an offset put on."""
         return self.layout.retract(y, offset, js.edge_length(self.topology, y.control.vertices))
@@ -131,7 +140,7 @@ class Residual(eqx.Module):
 
     def rows(self, y: Variables, held: Held) -> dict[str, Float[Array, "_"]]:
         """The rows before they are weighed, by the name of their prior; those of the scan are "distance"."""
-        place = self.model.place(y, self.model.refine(y))
+        place = self.model.place_of(y)
         assert place.surface is not None
         found = {"distance": self.distances(place, held)}
         return found | {prior.name: prior.rows(place, held.priors[prior.name]) for prior in self.model.priors}

@@ -21,10 +21,9 @@ from ..model.priors.shifts import ShiftPrior
 from ..model.residual import Held, Model, signed_distances
 from ..model.unknowns import Unknowns, Variables
 from .arrowhead import Arrowhead, ArrowheadFactor, factorise_arrowhead, solve_preconditioned
+from .derivatives import Derivatives, differentiate
 from .elements import (
-    Derivatives,
     are_many,
-    differentiate,
     distance_matrix,
     distances_transposed,
     jacobian,
@@ -361,7 +360,7 @@ def _solve(
     face, n = np.asarray(faces), structure.layout.n
     elements, n_shared = structure.elements, structure.layout.n - structure.n
     left, slopes = np.asarray(rows, np.float64), np.asarray(by, np.float64)
-    local = slopes_of_rows(elements, slopes.T, face)
+    local = slopes_of_rows(elements, slopes, face)
     gradient = np.zeros(n)
     gradient[: elements.n] = times_transposed(elements, local, left, face)
     matrix = structure.arrange(normal_matrix(elements, local, np.ones(len(left)), face), n_shared)

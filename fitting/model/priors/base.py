@@ -40,10 +40,16 @@ class Place(NamedTuple):
     """Control vertices where the fit started."""
     edge: Float[Array, ""]
     """Length of a control edge there, in mm."""
+    before: js.RefinedSurface | None = None
+    """The level before the last, where its normals are those of the surface: who asks for these alone spares a program
+    the normals of the last level, which cost most."""
 
     @property
     def mesh(self) -> js.RefinedSurface:
-        """A surface that has the control vertices on it: the refined one, or the control mesh of a dual scheme."""
+        """A surface that has the control vertices and those of the first level on it, if there are two levels or more:
+        the refined one or an earlier level of it, or the control mesh of a dual scheme."""
+        if self.before is not None:
+            return self.before
         if self.scheme.is_primal and self.surface is not None:
             return self.surface
         normals = js.estimate_normals(self.topology.control_fans, self.control.vertices)
