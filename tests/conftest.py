@@ -31,6 +31,7 @@ _LONGEST = (
     "test_likeness",
     "test_engine",
     "test_fit",
+    "test_examples",
     "test_command_fit",
     "test_command_endings",
 )
