@@ -274,7 +274,7 @@ def test_interpolating_control_says_what_it_cannot_do():
 @pytest.mark.parametrize(
     ("scheme", "mesh", "words"),
     [
-        (js.Loop(), meshes.pyramid(), r"Loop takes triangles only, but the mesh has 1 quads \(face 0\).*triangulated"),
+        (js.Loop(), meshes.pyramid(), r"Loop takes triangles only, but the mesh has 1 quads \(face 0\).*triangulate"),
         (js.ModifiedButterfly(), meshes.cube(), "ModifiedButterfly takes triangles only, but the mesh has 6 quads"),
         (
             js.Kobbelt(),
