@@ -6,7 +6,7 @@ from . import losses as losses
 from ._admissible import admissible_margin as admissible_margin
 from ._admissible import corner_cosines as corner_cosines
 from ._bezier_patches import BezierPatches as BezierPatches
-from ._bezier_patches import bezier_patches as bezier_patches
+from ._bezier_patches import make_patches as make_patches
 from ._bezier_patches import write_patches as write_patches
 from ._control import Control as Control
 from ._control import strong_float as strong_float
@@ -43,6 +43,7 @@ from ._padding import pad_control as pad_control
 from ._padding import pad_topology as pad_topology
 from ._padding import stack_topologies as stack_topologies
 from ._refine import refine as refine
+from ._refine import refine_levels as refine_levels
 from ._refine import refine_vertices as refine_vertices
 from ._regions import Regions as Regions
 from ._regions import as_regions as as_regions
@@ -79,8 +80,8 @@ from ._topology import Real as Real
 from ._topology import Topology as Topology
 from ._topology import build_topology as build_topology
 from ._within_tolerance import WithinTolerance as WithinTolerance
+from ._within_tolerance import prepare_to_print as prepare_to_print
 from ._within_tolerance import refine_within as refine_within
-from ._within_tolerance import surface_to_print as surface_to_print
 from .closest import FaceChoice as FaceChoice
 from .errors import MeshError as MeshError
 

@@ -20,8 +20,8 @@ from ._scheme.base import AbstractScheme, OldNormals
 from ._scheme.interpolating import Interpolating, Twist
 from ._surface import RefinedSurface
 from ._topology import MAX_LEVELS, build_topology
-from ._within_tolerance import refine_within, surface_to_print
-from .console import lasting_streams, plain_warnings
+from ._within_tolerance import prepare_to_print, refine_within
+from .console import simplify_warnings, survive_closed_streams
 from .errors import MeshError
 
 _LEVELS = 3
@@ -30,7 +30,7 @@ _COMMANDS = {"compare": Command(_compare.parser, _compare.run), **EXPORTS}
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns its exit status: 0, or 2 where the input or the arguments cannot be used."""
-    with lasting_streams(), plain_warnings():
+    with survive_closed_streams(), simplify_warnings():
         return _main(arguments)
 
 
@@ -50,7 +50,7 @@ def _main(arguments: Sequence[str] | None) -> int:
 def _run(options: argparse.Namespace) -> int:
     mesh = read_mesh(options.input, scale=options.scale, check=not options.repair)
     if options.repair:
-        mesh = mesh.repaired()
+        mesh = mesh.repair()
         for sentence in mesh.repairs:
             print(f"repaired: {sentence}")
     print(f"read     {options.input}: {_describe(mesh)}")
@@ -60,14 +60,14 @@ def _run(options: argparse.Namespace) -> int:
     control = mesh.control(weights=scheme.weights)
     if mesh.normals is None and scheme.uses_normals and not scheme.recomputes_normals:
         warn_of_folds(mesh, control)  # `build_topology` does where the normals were given
-    surface = _refined(scheme, mesh, control, options)
+    surface = _refine_as_asked(scheme, mesh, control, options)
     write_mesh(options.output, surface)
     kinds = f"{len(surface.faces[3]):,} triangles, {len(surface.faces[4]):,} quads"
     print(f"wrote    {options.output}: {len(surface.vertices):,} vertices, {kinds}")
     return 0
 
 
-def _refined(
+def _refine_as_asked(
     scheme: AbstractScheme, mesh: ControlMesh, control: Control, options: argparse.Namespace
 ) -> RefinedSurface:
     """By so many levels, or by those that a tolerance takes; the latter to be printed where it goes to STL."""
@@ -79,7 +79,7 @@ def _refined(
         return refine(scheme, topology, control)
     found = refine_within(scheme, mesh, control, options.tolerance, mesh_normals=mesh_normals)
     print(f"refined  {found.levels} times: the limit is within {found.largest:.3g} of the faces, RMS {found.rms:.3g}")
-    return surface_to_print(found.surface) if Path(options.output).suffix.lower() == ".stl" else found.surface
+    return prepare_to_print(found.surface) if Path(options.output).suffix.lower() == ".stl" else found.surface
 
 
 def _parser() -> argparse.ArgumentParser:

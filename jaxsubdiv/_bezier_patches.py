@@ -48,7 +48,7 @@ class BezierPatches(NamedTuple):
     largest: float
     rms: float
 
-    def summary(self) -> str:
+    def summarise(self) -> str:
         """What a command prints: counts, and how far the patches are from the surface."""
         return (
             f"patches  {len(self.is_exact):,}, of these {self.is_exact.sum():,} exact; from the surface: RMS "
@@ -56,7 +56,7 @@ class BezierPatches(NamedTuple):
         )
 
 
-def bezier_patches(
+def make_patches(
     scheme: AbstractScheme, mesh: ControlMesh, control: Control, levels: int, *, creases: Creases | None = None
 ) -> BezierPatches:
     """The surface as Bézier patches, for isogeometric analysis and CAD.
@@ -90,15 +90,17 @@ def bezier_patches(
         advice = "Begin at level 1." if scheme.is_primal else "Take another scheme."
         raise ValueError(f"{type(scheme).__name__} does not split these faces into four at every level. {advice}")
     x = np.asarray(refine_vertices(scheme, deep, control), np.float64)
-    samples = {size: _samples(x, deeper[size], size) for size in (3, 4)}
+    samples = {size: _take_samples(x, deeper[size], size) for size in (3, 4)}
     degree = 4 if isinstance(scheme, Loop) else 3
-    points, patches = _fit(faces, samples, degree)
+    points, patches = _fit_points(faces, samples, degree)
     away = [
-        np.linalg.norm(bernstein(size, degree, _places(size)) @ points[patches[size]] - samples[size], axis=2).ravel()
+        np.linalg.norm(
+            weigh_points(size, degree, _list_places(size)) @ points[patches[size]] - samples[size], axis=2
+        ).ravel()
         for size in (3, 4)
     ]
     off = np.concatenate(away)
-    exact = _exact(scheme, coarse, levels)
+    exact = _find_exact(scheme, coarse, levels)
     quads = patches[4].reshape(-1, 16)  # of Loop, of other degree, there are none
     return BezierPatches(points, patches[3], quads, exact, float(off.max()), float(np.sqrt(np.mean(off**2))))
 
@@ -126,19 +128,19 @@ def write_patches(path: str | os.PathLike[str], patches: BezierPatches) -> None:
             f"{path.name}: G+Smo's patches are quads, and {len(patches.triangles)} of these are triangles. Write a "
             ".vtu file, or fit a control mesh of quads."
         )
-    write_multipatch(path, patches.points[patches.quads[:, _by_rows()]], patches.quads[:, :4])
+    write_multipatch(path, patches.points[patches.quads[:, _order_by_rows()]], patches.quads[:, :4])
 
 
-def _by_rows() -> Int[np.ndarray, "16"]:
+def _order_by_rows() -> Int[np.ndarray, "16"]:
     """Where the points of a bicubic patch stand in VTK's order, row by row, the first coordinate running first."""
-    place = {powers: i for i, powers in enumerate(_exponents(4, 3))}
+    place = {powers: i for i, powers in enumerate(_list_exponents(4, 3))}
     return np.array([place[i, j] for j in range(4) for i in range(4)])
 
 
-def bernstein(size: int, degree: int, uv: Float[np.ndarray, "s 2"]) -> Float[np.ndarray, "s k"]:
+def weigh_points(size: int, degree: int, uv: Float[np.ndarray, "s 2"]) -> Float[np.ndarray, "s k"]:
     """Weights of the points of a patch, in VTK's order, at places of its face."""
     u, v = uv.T
-    powers = _exponents(size, degree)
+    powers = _list_exponents(size, degree)
     if size == 3:
         scale = np.array([comb(degree, a) * comb(degree - a, b) for a, b in powers])
         return scale * np.stack([u**a * v**b * (1 - u - v) ** (degree - a - b) for a, b in powers], axis=1)
@@ -147,7 +149,7 @@ def bernstein(size: int, degree: int, uv: Float[np.ndarray, "s 2"]) -> Float[np.
     return scale * np.stack(terms, axis=1)
 
 
-def _exponents(size: int, degree: int) -> list[tuple[int, int]]:
+def _list_exponents(size: int, degree: int) -> list[tuple[int, int]]:
     """Of u and v in the weight of every point, in VTK's order."""
     d, inner = degree, range(1, degree)
     if size == 4:
@@ -160,26 +162,26 @@ def _exponents(size: int, degree: int) -> list[tuple[int, int]]:
     return corners + sides + ([(1, 1)] if d == 3 else [(1, 1), (2, 1), (1, 2)])
 
 
-def _places(size: int) -> Float[np.ndarray, "s 2"]:
+def _list_places(size: int) -> Float[np.ndarray, "s 2"]:
     """Where the vertices of the deeper surface lie in a face, each once."""
     return np.unique(corner_uv(size, _DEEPER).reshape(-1, 2), axis=0) / 2**_DEEPER
 
 
-def _samples(x: Float[np.ndarray, "w 3"], deeper: Int[np.ndarray, "g k"], size: int) -> Float[np.ndarray, "f s 3"]:
+def _take_samples(x: Float[np.ndarray, "w 3"], deeper: Int[np.ndarray, "g k"], size: int) -> Float[np.ndarray, "f s 3"]:
     """The surface at these places of every face."""
     _, first = np.unique(corner_uv(size, _DEEPER).reshape(-1, 2), axis=0, return_index=True)
     return x[deeper.reshape(-1, 4**_DEEPER * size)[:, first]]
 
 
-def _fit(
+def _fit_points(
     faces: dict[int, Int[np.ndarray, "_ _"]], samples: dict[int, Float[np.ndarray, "_ _ 3"]], degree: int
 ) -> tuple[Float[np.ndarray, "n 3"], dict[int, Int[np.ndarray, "_ _"]]]:
     """Control points of all patches, and those of each: at corners, along sides, inside."""
-    outer = _outer_points(faces, degree)
+    outer = _number_outer_points(faces, degree)
     found, patches = [np.zeros((max(rows.max(initial=-1) for rows in outer.values()) + 1, 3))], {}
     n = len(found[0])
     for size, rows in outer.items():
-        weights, known = bernstein(size, degree, _places(size)), size
+        weights, known = weigh_points(size, degree, _list_places(size)), size
         for side in range(size):
             # The first side after the corners, and so on: its inner points weigh only where the places are on it.
             own = slice(known, known + degree - 1)
@@ -201,7 +203,7 @@ def _fit(
     return np.concatenate(found), patches
 
 
-def _outer_points(faces: dict[int, Int[np.ndarray, "_ _"]], degree: int) -> dict[int, Int[np.ndarray, "_ _"]]:
+def _number_outer_points(faces: dict[int, Int[np.ndarray, "_ _"]], degree: int) -> dict[int, Int[np.ndarray, "_ _"]]:
     """Numbers of the points at the corners of every face and along its sides; faces share those of a common side."""
     sides, inner = half_edges(faces), degree - 1
     used, corners = np.unique(np.concatenate([faces[size].ravel() for size in (3, 4)]), return_inverse=True)
@@ -217,7 +219,7 @@ def _outer_points(faces: dict[int, Int[np.ndarray, "_ _"]], degree: int) -> dict
     return found
 
 
-def _exact(scheme: AbstractScheme, topology: Topology, levels: int) -> Bool[np.ndarray, "f"]:
+def _find_exact(scheme: AbstractScheme, topology: Topology, levels: int) -> Bool[np.ndarray, "f"]:
     n = {size: len(topology.faces[size]) for size in (3, 4)}
     found = {size: np.full(n[size], isinstance(scheme, BezierTriangle) and levels == 0) for size in (3, 4)}
     if topology.limit is not None and topology.limit.patches is not None:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from ._bezier_patches import bezier_patches, write_patches
+from ._bezier_patches import make_patches, write_patches
 from ._io import read_mesh
 from ._scheme import SCHEMES
 from ._tetrahedra import fill_with_tetrahedra, write_tetrahedra
@@ -18,7 +18,7 @@ class Command(NamedTuple):
     run: Callable[[argparse.Namespace], int]
 
 
-def _tetrahedra_parser() -> argparse.ArgumentParser:
+def _make_tetrahedra_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="jaxsubdiv tetrahedra",
         description="Fill closed surfaces with tetrahedra for finite elements. Of surfaces in one another each "
@@ -44,12 +44,12 @@ def _fill(options: argparse.Namespace) -> int:
     cavities = names[len(options.surfaces) :]
     filled = fill_with_tetrahedra(surfaces, edge=options.edge, tolerance=options.tolerance, cavities=cavities)
     write_tetrahedra(options.output, filled)
-    print(filled.summary())
+    print(filled.summarise())
     print(f"wrote    {options.output}")
     return 0
 
 
-def _patches_parser() -> argparse.ArgumentParser:
+def _make_patches_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="jaxsubdiv patches",
         description="Write the smooth surface of a control mesh as Bézier patches, for isogeometric analysis and CAD.",
@@ -67,11 +67,14 @@ def _patches_parser() -> argparse.ArgumentParser:
 def _write_patches(options: argparse.Namespace) -> int:
     mesh = read_mesh(options.input, scale=options.scale)
     scheme = SCHEMES[options.scheme]()  # pyright: ignore[reportCallIssue]
-    patches = bezier_patches(scheme, mesh, mesh.control(), options.levels)
+    patches = make_patches(scheme, mesh, mesh.control(), options.levels)
     write_patches(options.output, patches)
-    print(patches.summary())
+    print(patches.summarise())
     print(f"wrote    {options.output}")
     return 0
 
 
-EXPORTS = {"tetrahedra": Command(_tetrahedra_parser, _fill), "patches": Command(_patches_parser, _write_patches)}
+EXPORTS = {
+    "tetrahedra": Command(_make_tetrahedra_parser, _fill),
+    "patches": Command(_make_patches_parser, _write_patches),
+}

@@ -16,8 +16,9 @@ from ._io import Surface
 from ._io._vtu import TETRAHEDRON, write_grid
 from ._regions import Regions
 from ._surface import RefinedSurface
-from ._tetrahedron_quality import TetrahedronQuality, measure_tetrahedra, shapes_of
-from ._tetwild import check_tetwild, run_tetwild
+from ._tetrahedron_quality import TetrahedronQuality, measure_shapes, measure_tetrahedra
+from ._tetwild import run_tetwild
+from .extras import import_extra
 from .half_edges import half_edges
 
 _EDGE, _TOLERANCE = 1 / 20, 1e-3  # of the diagonal of the bounding box, fTetWild's own
@@ -40,7 +41,7 @@ class Tetrahedra(NamedTuple):
     regions: Regions
     quality: TetrahedronQuality
 
-    def summary(self) -> str:
+    def summarise(self) -> str:
         """What a command prints: counts, regions, quality."""
         names, counts = self.regions.names, self.regions.counts()
         of_regions = ", ".join(f"{name} {count:,}" for name, count in zip(names, counts.tolist(), strict=True))
@@ -83,7 +84,7 @@ def fill_with_tetrahedra(
 
     Source: Y. Hu, T. Schneider, B. Wang, D. Zorin & D. Panozzo, Fast tetrahedral meshing in the wild, 2020.
     """
-    check_tetwild()
+    import_extra("pytetwild", "simulation", "tetrahedra")
     named = dict(surfaces) if isinstance(surfaces, Mapping) else {"solid": surfaces}
     unknown = [name for name in cavities if name not in named]
     if unknown or not named or not set(named) - set(cavities):
@@ -94,10 +95,10 @@ def fill_with_tetrahedra(
     meshes = [_Triangles(name, surface) for name, surface in named.items()]
     x = np.concatenate([mesh.x for mesh in meshes])
     diagonal = float(np.linalg.norm(np.ptp(x, axis=0)))
-    edge = _checked_length("edge", edge, _EDGE * diagonal)
-    tolerance = _checked_length("tolerance", tolerance, _TOLERANCE * diagonal)
+    edge = _check_length("edge", edge, _EDGE * diagonal)
+    tolerance = _check_length("tolerance", tolerance, _TOLERANCE * diagonal)
     before = np.cumsum([0, *(len(mesh.x) for mesh in meshes)])
-    rows = [first + mesh.turned(mesh.name in cavities) for first, mesh in zip(before, meshes, strict=False)]
+    rows = [first + mesh.turn(mesh.name in cavities) for first, mesh in zip(before, meshes, strict=False)]
     triangles = np.concatenate(rows)
     _warn_of_crossings(x, triangles)
     points, cells = run_tetwild(x, triangles, edge, tolerance / diagonal)
@@ -106,8 +107,8 @@ def fill_with_tetrahedra(
             "nothing is inside of the surfaces: are there parts that point inwards, or is `edge` too long?"
         )
     solid = [mesh for mesh in meshes if mesh.name not in cavities]
-    regions = _regions(solid, points[cells].mean(axis=1))
-    volume = _enclosed_volume(solid) - sum(mesh.volume for mesh in meshes if mesh.name in cavities)
+    regions = _find_regions(solid, points[cells].mean(axis=1))
+    volume = _measure_enclosed_volume(solid) - sum(mesh.volume for mesh in meshes if mesh.name in cavities)
     quality = measure_tetrahedra(points, cells, regions, x, triangles, volume)
     if quality.n_inverted:
         notices.warn(f"{quality.n_inverted} of {len(cells)} tetrahedra are inverted: a calculation on them would fail.")
@@ -125,7 +126,7 @@ def write_tetrahedra(path: str | os.PathLike[str], tetrahedra: Tetrahedra) -> No
         FileNotFoundError: its folder is not there.
         ImportError: pyvista, of the extras `io` and `simulation`, is not installed.
     """
-    angles, jacobians, _ = shapes_of(tetrahedra.points, tetrahedra.cells)
+    angles, jacobians, _ = measure_shapes(tetrahedra.points, tetrahedra.cells)
     data = {"region": tetrahedra.regions.rows + 1, "scaled_jacobian": jacobians, "smallest_angle": angles}
     numbers = {name: i + 1 for i, name in enumerate(tetrahedra.regions.names)}
     write_grid(path, tetrahedra.points, [(TETRAHEDRON, tetrahedra.cells)], data, numbers)
@@ -155,7 +156,7 @@ class _Triangles:
         if self.volume <= 0:
             raise ValueError(f"the faces of the surface '{name}' point inwards: turn them, `faces[:, ::-1]`.")
 
-    def turned(self, inwards: bool) -> Int[np.ndarray, "t 3"]:
+    def turn(self, inwards: bool) -> Int[np.ndarray, "t 3"]:
         return self.triangles[:, ::-1] if inwards else self.triangles
 
     def encloses(self, points: Float[np.ndarray, "p 3"]) -> np.ndarray:
@@ -165,11 +166,11 @@ class _Triangles:
         middle = self.x.mean(axis=0)  # single precision is enough once the origin is near
         corners = jnp.asarray(self.x[self.triangles] - middle, jnp.float32)
         blocked = jnp.asarray((padded - middle).reshape(blocks, _POINTS_AT_ONCE, 3), jnp.float32)
-        return np.asarray(_winding(corners, blocked)).reshape(-1)[: len(points)] > 0.5
+        return np.asarray(_count_windings(corners, blocked)).reshape(-1)[: len(points)] > 0.5
 
 
 @jax.jit
-def _winding(corners: Float[Array, "t 3 3"], points: Float[Array, "b p 3"]) -> Float[Array, "b p"]:
+def _count_windings(corners: Float[Array, "t 3 3"], points: Float[Array, "b p 3"]) -> Float[Array, "b p"]:
     """How often triangles wind around points. Source: A. Van Oosterom & J. Strackee, 1983, eq. (8)."""
 
     def of_block(block: Float[Array, "p 3"]) -> Float[Array, "p"]:
@@ -183,7 +184,7 @@ def _winding(corners: Float[Array, "t 3 3"], points: Float[Array, "b p 3"]) -> F
     return jax.lax.map(of_block, points)
 
 
-def _regions(solid: Sequence[_Triangles], middles: Float[np.ndarray, "m 3"]) -> Regions:
+def _find_regions(solid: Sequence[_Triangles], middles: Float[np.ndarray, "m 3"]) -> Regions:
     """Of every tetrahedron the smallest surface around its middle."""
     rows = np.full(len(middles), int(np.argmax([mesh.volume for mesh in solid])))
     if len(solid) > 1:
@@ -192,7 +193,7 @@ def _regions(solid: Sequence[_Triangles], middles: Float[np.ndarray, "m 3"]) -> 
     return Regions(rows, tuple(mesh.name for mesh in solid))
 
 
-def _enclosed_volume(solid: Sequence[_Triangles]) -> float:
+def _measure_enclosed_volume(solid: Sequence[_Triangles]) -> float:
     """Of surfaces that lie in one another or side by side."""
     alone = [
         mesh
@@ -202,7 +203,7 @@ def _enclosed_volume(solid: Sequence[_Triangles]) -> float:
     return sum(mesh.volume for mesh in alone)
 
 
-def _checked_length(name: str, value: float | None, usual: float) -> float:
+def _check_length(name: str, value: float | None, usual: float) -> float:
     value = usual if value is None else float(value)
     if not (np.isfinite(value) and value > 0):
         raise ValueError(f"`{name}` must be a positive length in the unit of the surface; got {value}.")

@@ -46,7 +46,7 @@ class TetrahedronQuality(NamedTuple):
         )
 
 
-def shapes_of(
+def measure_shapes(
     points: Float[np.ndarray, "n 3"], cells: Int[np.ndarray, "m 4"]
 ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
     """Smallest dihedral angle in degrees, scaled Jacobian and signed volume of every tetrahedron."""
@@ -76,8 +76,8 @@ def measure_tetrahedra(
     enclosed_volume: float,
 ) -> TetrahedronQuality:
     """Measure tetrahedra against the triangles of the surfaces that they fill."""
-    angles, jacobians, volumes = shapes_of(points, cells)
-    bounding = _bounding_faces(cells, regions.rows)
+    angles, jacobians, volumes = measure_shapes(points, cells)
+    bounding = _find_bounding_faces(cells, regions.rows)
     there, back = (x, points[bounding]), (points[np.unique(bounding)], x[triangles])
     away = np.concatenate([closest_on_mesh(*pair)[0] for pair in (there, back)])
     smallest, jacobian = (tuple(np.quantile(values, _SHARES).tolist()) for values in (angles, jacobians))
@@ -86,7 +86,7 @@ def measure_tetrahedra(
     return TetrahedronQuality(smallest, jacobian, n_inverted, rms, largest, float(volumes.sum()), enclosed_volume)
 
 
-def _bounding_faces(cells: Int[np.ndarray, "m 4"], regions: Int[np.ndarray, "m"]) -> Int[np.ndarray, "b 3"]:
+def _find_bounding_faces(cells: Int[np.ndarray, "m 4"], regions: Int[np.ndarray, "m"]) -> Int[np.ndarray, "b 3"]:
     """Faces with a tetrahedron of one region on one side only."""
     faces = cells[:, _FACES].reshape(-1, 3)
     ordered, region = np.sort(faces, axis=1), np.repeat(regions, 4)

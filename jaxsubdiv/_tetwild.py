@@ -3,7 +3,6 @@
 import subprocess
 import sys
 import tempfile
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -18,19 +17,6 @@ points, cells = pytetwild.tetrahedralize(
 )
 numpy.savez("made.npz", points=points, cells=cells)
 """
-
-
-def check_tetwild() -> None:
-    """See that pytetwild is there.
-
-    Raises:
-        ImportError: it is not installed.
-    """
-    if sys.modules.get("pytetwild", "") is None or find_spec("pytetwild") is None:
-        raise ImportError(
-            "tetrahedra are made by pytetwild, which is not installed. Install it with: pip install "
-            "'jaxsubdiv[simulation]'"
-        )
 
 
 def run_tetwild(

@@ -74,7 +74,7 @@ def refine_within(
             break
         topology = build_topology(mesh, scheme, levels, mesh_normals=mesh_normals, limit=limit, creases=creases)
         surface = refine(scheme, topology, control)
-        away = _distances_of_limit(scheme, mesh, control, surface, levels, creases)
+        away = _measure_from_limit(scheme, mesh, control, surface, levels, creases)
         largest, rms = float(away.max()), float(np.sqrt(np.mean(away**2)))
         if largest <= tolerance:
             return WithinTolerance(surface, levels, largest, rms)
@@ -84,7 +84,7 @@ def refine_within(
     )
 
 
-def surface_to_print(surface: RefinedSurface) -> RefinedSurface:
+def prepare_to_print(surface: RefinedSurface) -> RefinedSurface:
     """The surface as binary STL holds it: triangles, and vertices rounded to single precision.
 
     A vertex is rounded once, so that all of its triangles have it bit for bit, and readers of the file weld them into
@@ -111,7 +111,7 @@ def surface_to_print(surface: RefinedSurface) -> RefinedSurface:
     return RefinedSurface(jnp.asarray(single), jnp.asarray(surface.normals, jnp.float32), faces)
 
 
-def _distances_of_limit(
+def _measure_from_limit(
     scheme: AbstractScheme,
     mesh: ControlMesh,
     control: Control,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxsubdiv as js
-from jaxsubdiv._bezier_patches import bernstein
+from jaxsubdiv._bezier_patches import weigh_points
 
 pyvista = pytest.importorskip("pyvista")
 
@@ -15,7 +15,7 @@ UV = np.array([[0.1, 0.2], [0.5, 0.3], [0.0, 0.7], [0.25, 0.5]])
 
 
 def patches_of(scheme, mesh, levels) -> js.BezierPatches:
-    return js.bezier_patches(scheme, mesh, mesh.control(), levels)
+    return js.make_patches(scheme, mesh, mesh.control(), levels)
 
 
 def on_surface(scheme, mesh, size: int, n: int) -> np.ndarray:
@@ -42,7 +42,7 @@ def test_patches_are_the_surface_where_that_is_polynomial(name, tmp_path):
     for size, points, surface in zip((3, 4), (patches.triangles, patches.quads), expected, strict=True):
         if len(points):
             degree = 4 if name == "loop" else 3
-            np.testing.assert_allclose(bernstein(size, degree, UV) @ patches.points[points], surface, atol=1e-14)
+            np.testing.assert_allclose(weigh_points(size, degree, UV) @ patches.points[points], surface, atol=1e-14)
     js.write_patches(tmp_path / "patches.vtu", patches)
     np.testing.assert_allclose(evaluated_by_vtk(tmp_path / "patches.vtu"), np.concatenate(expected), atol=1e-14)
 
@@ -76,8 +76,8 @@ def test_the_error_is_the_distance_from_the_surface():
     patches = patches_of(scheme, mesh, 1)
     deep = js.refine(scheme, js.build_topology(mesh, scheme, 4), mesh.control())
     t = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, 9)]), axis=-1).reshape(-1, 2)
-    in_quads = (bernstein(4, 3, t) @ patches.points[patches.quads]).reshape(-1, 3)
-    in_triangles = (bernstein(3, 3, t[t.sum(axis=1) <= 1]) @ patches.points[patches.triangles]).reshape(-1, 3)
+    in_quads = (weigh_points(4, 3, t) @ patches.points[patches.quads]).reshape(-1, 3)
+    in_triangles = (weigh_points(3, 3, t[t.sum(axis=1) <= 1]) @ patches.points[patches.triangles]).reshape(-1, 3)
     points = np.concatenate([in_quads, in_triangles])
     on, _ = js.evaluate(deep, js.search_closest(deep, points))
     away = np.linalg.norm(points - np.asarray(on), axis=1)
@@ -99,7 +99,7 @@ def test_gismo_reads_the_patches_and_finds_the_same_sides(tmp_path):
     to_powers = np.array([[1, 0, 0, 0], [-3, 3, 0, 0], [3, -6, 3, 0], [-1, 3, -3, 1]])
     surface = np.einsum("ui,vj,qjix->qvux", u @ to_powers, v @ to_powers, rows)
     uv = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, 5)]), axis=-1).reshape(-1, 2)
-    expected = bernstein(4, 3, uv) @ patches.points[patches.quads]
+    expected = weigh_points(4, 3, uv) @ patches.points[patches.quads]
     np.testing.assert_allclose(surface.reshape(6, 25, 3), expected, atol=1e-14)
     # Sides that are one have the same points: west 1, east 2, south 3, north 4.
     sides = {1: surface[:, :, 0], 2: surface[:, :, -1], 3: surface[:, 0], 4: surface[:, -1]}

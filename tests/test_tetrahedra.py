@@ -9,7 +9,7 @@ import trimesh
 
 import jaxsubdiv as js
 from jaxsubdiv import _tetwild
-from jaxsubdiv._tetrahedron_quality import shapes_of
+from jaxsubdiv._tetrahedron_quality import measure_shapes
 
 pytest.importorskip("pytetwild")
 pyvista = pytest.importorskip("pyvista")
@@ -137,7 +137,7 @@ def test_nothing_is_left_where_it_runs_and_a_failure_is_told(tmp_path, monkeypat
 def test_inverted_tetrahedra_are_counted(filled):
     flipped = filled.cells.copy()
     flipped[:3] = flipped[:3, [1, 0, 2, 3]]
-    _, jacobians, volumes = shapes_of(filled.points, flipped)
+    _, jacobians, volumes = measure_shapes(filled.points, flipped)
     assert np.sum(volumes <= 0) == np.sum(jacobians <= 0) == 3
     flat = np.zeros((4, 3))
-    assert [values.tolist() for values in shapes_of(flat, np.arange(4)[None])[1:]] == [[0.0], [0.0]]
+    assert [values.tolist() for values in measure_shapes(flat, np.arange(4)[None])[1:]] == [[0.0], [0.0]]

@@ -51,7 +51,7 @@ def test_a_print_is_watertight_once_it_is_read(tmp_path):
     vertices, faces = meshes.mixed_closed()
     mesh = js.ControlMesh(vertices / 3 + 1000.0 / 7, faces)
     found = js.refine_within(js.Interpolating(), mesh, mesh.control(), 0.02)
-    js.write_mesh(tmp_path / "print.stl", js.surface_to_print(found.surface))
+    js.write_mesh(tmp_path / "print.stl", js.prepare_to_print(found.surface))
     assert (tmp_path / "print.stl").stat().st_size == 84 + 50 * len(found.surface.triangles())
     read = trimesh.load(tmp_path / "print.stl")
     assert read.is_watertight and read.is_winding_consistent
@@ -63,9 +63,9 @@ def test_a_surface_that_no_printer_takes_is_told():
     sheet = js.ControlMesh(*meshes.grid(2, 2))
     surface = js.refine(js.Interpolating(), js.build_topology(sheet, js.Interpolating(), 1), sheet.control())
     with pytest.warns(UserWarning, match="has 16 boundary edges: it is not watertight"):
-        js.surface_to_print(surface)
+        js.prepare_to_print(surface)
     ball = js.ControlMesh(*meshes.octahedron())
     far = js.ControlMesh(ball.vertices * 1e-6 + 1e3, ball.faces, check=False)
     surface = js.refine(js.Interpolating(), js.build_topology(ball, js.Interpolating(), 0), far.control())
     with pytest.warns(UserWarning, match="vertices coincide with others in single precision"):
-        js.surface_to_print(surface)
+        js.prepare_to_print(surface)

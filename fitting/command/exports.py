@@ -1,10 +1,10 @@
 """What the command writes for other programs: a level by tolerance, tetrahedra, and Bézier patches."""
 
 import argparse
-import importlib
 from pathlib import Path
 
 import jaxsubdiv as js
+from jaxsubdiv.extras import import_extra
 
 from ..report.at_level import SurfaceAtLevel
 from ..report.result import FitResult
@@ -20,13 +20,7 @@ def check_exports(options: argparse.Namespace) -> None:
     modules = ["pyvista"] if options.patches is not None else []
     modules += ["pyvista", "pytetwild", "ipctk"] if options.tetrahedra is not None else []
     for module in modules:
-        try:
-            importlib.import_module(module)
-        except ImportError as error:
-            raise ImportError(
-                f"--tetrahedra and --patches need {module}, which cannot be imported ({error}). Install it with: pip "
-                "install 'jaxsubdiv[simulation]'"
-            ) from error
+        import_extra(module, "simulation", "--tetrahedra and --patches")
 
 
 def find_level(result: FitResult, options: argparse.Namespace) -> int | None:
@@ -37,11 +31,11 @@ def find_level(result: FitResult, options: argparse.Namespace) -> int | None:
     """
     if options.surface_tolerance is None:
         return options.surface_level
-    _ = result.at_level(0)  # raises where the surface has no other level
+    _ = result.refine_to(0)  # raises where the surface has no other level
     settings = result.fit.settings
     found = js.refine_within(
         result.scheme,
-        _bare_mesh(result),
+        _make_bare_mesh(result),
         result.control,
         options.surface_tolerance,
         mesh_normals=settings.mesh_normals,
@@ -67,23 +61,23 @@ def write_exports(folder: Path, result: FitResult, at: SurfaceAtLevel, options: 
                 at.surface, edge=None if options.tetrahedra is True else options.tetrahedra
             )
             js.write_tetrahedra(folder / TETRAHEDRA, filled)
-            print(filled.summary())
+            print(filled.summarise())
             written.append(TETRAHEDRA)
         except (ValueError, RuntimeError) as error:
             print(f"note     no tetrahedra: {error}")
     if options.patches is not None:
         try:
-            _ = result.at_level(0)
-            patches = js.bezier_patches(result.scheme, _bare_mesh(result), result.control, options.patches)
+            _ = result.refine_to(0)
+            patches = js.make_patches(result.scheme, _make_bare_mesh(result), result.control, options.patches)
             for name in PATCHES[: 1 if len(patches.triangles) else 2]:  # the second takes quads alone
                 js.write_patches(folder / name, patches)
                 written.append(name)
-            print(patches.summary())
+            print(patches.summarise())
         except ValueError as error:
             print(f"note     no patches: {error}")
     return written
 
 
-def _bare_mesh(result: FitResult) -> js.ControlMesh:
+def _make_bare_mesh(result: FitResult) -> js.ControlMesh:
     """Without the fitted normals, which may be such as the tables warn of."""
     return js.ControlMesh(result.control.vertices, result.fit.topology.control_faces, check=False)

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from jaxsubdiv.console import lasting_streams, plain_warnings
+from jaxsubdiv.console import simplify_warnings, survive_closed_streams
 
 from ..run.names import name_folder
 from ..run.surface_files import check_formats
@@ -21,7 +21,7 @@ from .template import make_template_of_all
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line: exit status 0, 1 for a fit not to be trusted, 2 for an input of no use, 130 where stopped."""
-    with lasting_streams(), plain_warnings():
+    with survive_closed_streams(), simplify_warnings():
         return _main(arguments)
 
 

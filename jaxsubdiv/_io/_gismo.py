@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..files import replacing
+from ..files import replace_file
 from ..half_edges import half_edges
 
 _KNOTS = '<KnotVector degree="3">0 0 0 0 1 1 1 1</KnotVector>'
@@ -37,17 +37,17 @@ def write_multipatch(path: Path, points: Float[np.ndarray, "q 16 3"], corners: I
             f' <Geometry type="TensorBSpline2" id="{number}">\n{_BASIS}'
             f'  <coefs geoDim="3">\n{coefficients}\n  </coefs>\n </Geometry>\n'
         )
-    found = zip(("interfaces", "boundary"), _sides(corners), strict=True)
-    sides = "".join(f"  <{name}>{_lines(rows)}</{name}>\n" for name, rows in found if len(rows))
+    found = zip(("interfaces", "boundary"), _pair_sides(corners), strict=True)
+    sides = "".join(f"  <{name}>{_format_rows(rows)}</{name}>\n" for name, rows in found if len(rows))
     parts.append(
         f' <MultiPatch parDim="2" id="{len(points)}">\n  <patches type="id_range">0 {len(points) - 1}</patches>\n'
         f"{sides} </MultiPatch>\n</xml>\n"
     )
-    with replacing(path) as unfinished:
+    with replace_file(path) as unfinished:
         unfinished.write_text("".join(parts), encoding="utf-8")
 
 
-def _sides(corners: Int[np.ndarray, "q 4"]) -> tuple[Int[np.ndarray, "i 8"], Int[np.ndarray, "b 2"]]:
+def _pair_sides(corners: Int[np.ndarray, "q 4"]) -> tuple[Int[np.ndarray, "i 8"], Int[np.ndarray, "b 2"]]:
     """Of every pair of sides: patch and side of both, which directions of the second those of the first are, and
     whether they run the same way; and patch and side of every side that has no other."""
     sides = half_edges({4: corners})
@@ -67,5 +67,5 @@ def _sides(corners: Int[np.ndarray, "q 4"]) -> tuple[Int[np.ndarray, "i 8"], Int
     return np.concatenate([pairs, directions, same_way], axis=1), np.stack([alone // 4, _NUMBER[alone % 4]], axis=1)
 
 
-def _lines(rows: Int[np.ndarray, "n k"]) -> str:
+def _format_rows(rows: Int[np.ndarray, "n k"]) -> str:
     return "\n   ".join(" ".join(map(str, row)) for row in rows.tolist())

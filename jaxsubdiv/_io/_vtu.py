@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped
 
 from ..errors import MeshError
-from ..files import replacing
-from ._contents import library
+from ..extras import import_extra
+from ..files import replace_file
 from ._vtk import watch
 
 TETRAHEDRON, BEZIER_TRIANGLE, BEZIER_QUAD = 10, 76, 77  # VTK's numbers of its kinds of cells
@@ -29,7 +29,7 @@ def check_can_write_vtu(path: str | os.PathLike[str]) -> Path:
         raise MeshError(f"{path.name}: cells of this kind go to .vtu files. Name one.")
     if not path.parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, "the folder does not exist, create it first", str(path.parent))
-    library("pyvista", ".vtu files")
+    import_extra("pyvista", "io", ".vtu files")
     return path
 
 
@@ -50,7 +50,7 @@ def write_grid(
         numbers: name -> whole number, kept as field data: meshio reads no words there.
     """
     path = check_can_write_vtu(path)
-    pyvista = library("pyvista", ".vtu files")
+    pyvista = import_extra("pyvista", "io", ".vtu files")
     rows = [np.insert(corners, 0, corners.shape[1], axis=1).ravel() for _, corners in cells if len(corners)]
     kinds = np.concatenate([np.full(len(corners), kind, np.uint8) for kind, corners in cells])
     grid = pyvista.UnstructuredGrid(np.concatenate(rows), kinds, np.ascontiguousarray(points, np.float64))
@@ -58,8 +58,8 @@ def write_grid(
         grid.cell_data[name] = column
     for name, number in (numbers or {}).items():
         grid.field_data[name] = np.array([number])
-    writer = library("vtkmodules.vtkIOXML", ".vtu files").vtkXMLUnstructuredGridWriter()
-    with replacing(path) as unfinished:
+    writer = import_extra("vtkmodules.vtkIOXML", "io", ".vtu files").vtkXMLUnstructuredGridWriter()
+    with replace_file(path) as unfinished:
         writer.SetInputData(grid)
         writer.SetFileName(str(unfinished))
         done, messages = watch(writer.Write)
