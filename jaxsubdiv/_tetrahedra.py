@@ -54,8 +54,8 @@ class Tetrahedra(NamedTuple):
 def fill_with_tetrahedra(
     surfaces: Surface | Mapping[str, Surface],
     *,
-    edge: float | None = None,
-    tolerance: float | None = None,
+    edge: float | int | None = None,
+    tolerance: float | int | None = None,
     cavities: Sequence[str] = (),
 ) -> Tetrahedra:
     """Fill closed surfaces with tetrahedra, for finite elements.
@@ -203,7 +203,7 @@ def _measure_enclosed_volume(solid: Sequence[_Triangles]) -> float:
     return sum(mesh.volume for mesh in alone)
 
 
-def _check_length(name: str, value: float | None, usual: float) -> float:
+def _check_length(name: str, value: float | int | None, usual: float) -> float:
     value = usual if value is None else float(value)
     if not (np.isfinite(value) and value > 0):
         raise ValueError(f"`{name}` must be a positive length in the unit of the surface; got {value}.")

@@ -41,7 +41,7 @@ def refine_within(
     scheme: AbstractScheme,
     mesh: ControlMesh,
     control: Control,
-    tolerance: float,
+    tolerance: float | int,
     *,
     mesh_normals: bool = False,
     limit: bool = False,
