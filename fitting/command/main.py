@@ -15,7 +15,7 @@ from .many import fit_all
 from .messages import report_failure
 from .one import fit_one
 from .options import check_options, make_parser, make_recipe
-from .programs import keep_compiled_programs
+from .programs import calculate_in_one_thread, keep_compiled_programs
 from .template import make_template_of_all
 
 
@@ -42,6 +42,7 @@ def _main(arguments: Sequence[str] | None) -> int:
     if options.template_out and (options.control or options.prior or not options.scans):
         parser.error("--template-out makes a template of scans: give scans, and neither --control nor --prior")
     keep_compiled_programs()
+    calculate_in_one_thread()
     try:
         check_options(options)
         scans, recipe = find_sources(options), make_recipe(options)
