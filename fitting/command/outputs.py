@@ -19,6 +19,7 @@ from ..run.fit_scan import ScanFit
 from ..run.folder import CARRIED, LANDMARKS, fill_folder
 from ..run.surface_files import write_surface
 from ..scan.landmarks import write_landmarks
+from .exports import find_level, write_exports
 from .inputs import Job
 
 
@@ -52,7 +53,8 @@ def save_outputs(
 def _write_surface(folder: Path, result: FitResult, options: argparse.Namespace, frame: Frame | None) -> list[str]:
     """The surface's files; where it has no such level, told, none: the fit itself is not lost."""
     try:
-        return write_surface(folder, result.refine_to(options.surface_level), options.surface, frame)
+        at = result.refine_to(find_level(result, options))
+        return write_surface(folder, at, options.surface, frame) + write_exports(folder, result, at, options)
     except (ValueError, MemoryError) as error:
         print(f"note     no surface: {str(error) or 'it takes more memory than there is'}")
         return []
