@@ -164,6 +164,18 @@ class Posterior:
         average, n_faces = neighbourhood_mean(topology), topology.n_control_faces
         return misfit_variances(distances, weights, at_points, patches, average, n_faces)
 
+    def displace(self, offsets: Float[np.ndarray, "u n"]) -> Float[np.ndarray, "v 3 n"]:
+        """How far offsets of the unknowns move every vertex of the surface, to first order, in mm."""
+        structure, of_surface = self.equations.structure, np.asarray(self.equations.found.of_surface)
+        elements, face = structure.elements, structure.faces_of_vertices(len(of_surface))
+        padded = np.concatenate([offsets[: elements.n], np.zeros((1, offsets.shape[1]))]).astype(of_surface.dtype)
+        moved = np.zeros((*of_surface.shape[:2], offsets.shape[1]))
+        order = np.argsort(face, kind="stable")
+        for rows in np.split(order, np.flatnonzero(np.diff(face[order])) + 1):
+            own = face[rows[0]]
+            moved[rows] = of_surface[rows][:, :, elements.seeds_of[own]] @ padded[elements.columns[own]]
+        return moved
+
     def draws(self, n: int, seed: int = 0) -> Float[np.ndarray, "u n"]:
         """Random offsets of the unknowns, as probable as the posterior has them; see `Layout` for their order."""
         size = self.fit.model.layout.n

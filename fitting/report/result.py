@@ -28,6 +28,7 @@ from .record import Fit, choose_faces, look_at
 from .refit import Refit, make_refit
 from .report import RegionDistance, Report, SliceShift, WorstPlace
 from .saved import save_fit
+from .thickness import Thickness, measure_thickness
 
 
 @final
@@ -146,6 +147,36 @@ class FitResult:
     def _measures(self) -> tuple[Measure, ...]:
         """With the valves that the groups' names say: asked for by every report."""
         return measure_surface(self.posterior, self.control_mesh)
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the regions that were fitted as layers, from the inside out; none of other fits."""
+        return self.fit.inputs.get("layers") or ()
+
+    def faces_of(self, region: str) -> Bool[np.ndarray, "f"]:
+        """Which faces of the refined surface lie in a region of the control mesh, triangles first.
+
+        Raises:
+            ValueError: there is no such region.
+        """
+        of_control = None if self.fit.regions is None else self.fit.regions.faces
+        if of_control is None or region not in of_control.names:
+            there = "none" if of_control is None else ", ".join(of_control.names)
+            raise ValueError(f"'{region}' is no region of the control mesh; it has {there}.")
+        owner = js.control_faces_of(self.scheme, self.fit.topology, self.surface, self.control)
+        return of_control.rows[owner] == of_control.names.index(region)
+
+    def thickness(self, region: str, other: str) -> Thickness:
+        """How thick what lies between two regions is, at every vertex of one of them, with standard deviations.
+
+        Args:
+            region: where it is measured.
+            other: the region on the other side, such as the next layer, or the outside of a wall.
+
+        Raises:
+            ValueError: there is no such region.
+        """
+        return measure_thickness(self.posterior, (region, other), self.faces_of(region), self.faces_of(other))
 
     @functools.cached_property
     def control_mesh(self) -> js.ControlMesh:
