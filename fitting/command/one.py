@@ -11,6 +11,7 @@ import numpy as np
 import jaxsubdiv as js
 from jaxsubdiv.console import printable
 
+from ..image.read import is_image
 from ..report.result import FitResult
 from ..report.saved import read_marks
 from ..run.checkpoint import differing
@@ -46,7 +47,7 @@ def _fit_and_save(scan: Source | None, folder: Path, options: argparse.Namespace
     job = read_inputs(scan, options, recipe)
     slices = "" if job.scan.slices is None else f" in {len(np.unique(job.scan.slices))} slices"
     print(f"scan     {job.scan.n_points:,} points{slices}, {describe_size(np.asarray(job.scan.points))}")
-    if job.seen is not None:
+    if job.seen is not None or (job.layered is not None and scan is not None and is_image(scan.path)):
         recipe = suggest_for_image(recipe, job.scan, options)
     marks = mark_job(job, recipe, options)
     done = find_done(folder, marks) if options.resume else None
@@ -58,19 +59,20 @@ def _fit_and_save(scan: Source | None, folder: Path, options: argparse.Namespace
         counts = f"{len(job.mesh.vertices):,} vertices, {job.mesh.n_faces:,} faces"
         print(f"control  {counts}, {describe_size(job.mesh.vertices)}")
         print_regions(job.scan, job.mesh, job.regions)
+    own = {"landmarks": job.landmarks, "boundary": job.boundary, "regions": job.regions}
+    own |= {} if job.layered is None else job.layered.options(recipe.priors)
     with Progress(recipe.max_sweeps) as progress:
         found = recipe.fit_scan(
             job.scan,
             job.mesh,
-            landmarks=job.landmarks,
-            boundary=job.boundary,
-            regions=job.regions,
+            **own,
             on_stage=progress.stage,
             throw=False,
             on_sweep=progress.update,
             checkpoint=folder,
             keep_checkpoint=True,
         )
+    found = found if job.layered is None else job.layered.judge(found)
     seconds = time.perf_counter() - began
     report, off = found.result.report(uncertainty=True), misfit(found.result)
     print(f"done     in {seconds:.1f} s{describe_ending(found, off)}\n\n{dataclasses.replace(report, warnings=[])}\n")

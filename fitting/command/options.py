@@ -89,6 +89,12 @@ def make_parser() -> argparse.ArgumentParser:
         help="JSON, label of the scan: group of the template's faces; default: by the names",
     )
     add(
+        "--layers",
+        metavar="FILE",
+        help="fit several surfaces at once, such as lining and outside of a wall: JSON, layer: label of its points, "
+        "from the inside out; of a label map, the labels of all inside it; OUT gets layers/ with each, and thickness",
+    )
+    add(
         "--series",
         action="store_true",
         help="the scans are frames of one anatomy in the order of their names: fitted at once, with --control, one "

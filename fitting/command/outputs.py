@@ -10,8 +10,9 @@ import jaxsubdiv as js
 from jaxsubdiv.frames import Frame
 
 from ..image.slices import Slice, cut_slices
+from ..report.layers import LayersFit
 from ..report.page import write_page
-from ..report.picture import draw_fit
+from ..report.picture import draw_fit, draw_thickness
 from ..report.result import FitResult
 from ..report.saved import save_fit
 from ..run.carry import carry_landmarks
@@ -21,6 +22,8 @@ from ..run.surface_files import write_surface
 from ..scan.landmarks import write_landmarks
 from .inputs import Job
 
+_LAYERS = "layers"
+
 
 def save_outputs(
     folder: Path, found: ScanFit, title: str, marks: dict[str, str], job: Job, options: argparse.Namespace
@@ -28,6 +31,8 @@ def save_outputs(
     """The fit as files, all of them in place of those of an earlier one, or none."""
     result, frame = found.result, job.scan.frame or (job.carried.frame if job.carried is not None else None)
     slices = cut_job_slices(job, result)
+    if result.layers:
+        _write_layers(folder / _LAYERS, LayersFit(result), options, frame)
     with filling(folder) as new:
         js.write_mesh(new / "control.obj", result.control_mesh, frame=frame)
         written = ["control.obj", *_write_surface(new, result, options, frame)]
@@ -49,10 +54,36 @@ def save_outputs(
     print(f"wrote    {', '.join(written)} in {folder}")
 
 
+def _write_layers(folder: Path, found: LayersFit, options: argparse.Namespace, frame: Frame | None) -> None:
+    """Every layer's control mesh and surface, and what lies between it and the next, as values and as a picture."""
+    folder.mkdir(exist_ok=True)
+    at = found.result.at_level()
+    for number, name in enumerate(found.names):
+        thickness = found.thickness(name)
+        of_surface = {
+            "distance_mm": at.distances,
+            "deviation_mm": at.deviations,
+            "thickness_mm": thickness.values,
+            "thickness_deviation_mm": thickness.deviations,
+        }
+        values = {word: found.of_layer(name, numbers) for word, numbers in of_surface.items()}
+        js.write_mesh(folder / f"{name}_control.obj", found.control_mesh(name), frame=frame)
+        written = write_surface(folder, found.surface(name), values, options.surface, frame, name)
+        if number + 1 < len(found.names) and (thickness.shares > 0).any():
+            try:
+                draw_thickness(found.result.surface, thickness).savefig(folder / f"{name}_thickness.png")
+                written.append(f"{name}_thickness.png")
+            except ImportError as error:
+                print(f"note     no picture: {error}")
+        print(f"wrote    {name}_control.obj, {', '.join(written)} in {folder}")
+
+
 def _write_surface(folder: Path, result: FitResult, options: argparse.Namespace, frame: Frame | None) -> list[str]:
     """The surface's files; where it has no such level, told, none: the fit itself is not lost."""
     try:
-        return write_surface(folder, result.at_level(options.surface_level), options.surface, frame)
+        at = result.at_level(options.surface_level)
+        values = {"distance_mm": at.distances, "deviation_mm": at.deviations}
+        return write_surface(folder, at.surface, values, options.surface, frame)
     except (ValueError, MemoryError) as error:
         print(f"note     no surface: {str(error) or 'it takes more memory than there is'}")
         return []

@@ -12,7 +12,7 @@ import jaxsubdiv as js
 from jaxsubdiv.console import printable
 
 from ..image.slices import Slice
-from ..scan.layers import choose_faces
+from ..scan.layers import part_of
 from .result import FitResult
 from .thickness import Thickness
 
@@ -77,12 +77,8 @@ def draw_thickness(surface: js.RefinedSurface, thickness: Thickness, *, title: s
     figure = make_figure(15.0, 9.5)
     figure.suptitle(printable(title) or f"{thickness.layer} to {thickness.other}", fontsize=14, parse_math=False)
     known = thickness.shares > 0
-    corners = np.concatenate(
-        [np.pad(np.asarray(surface.faces[3]), ((0, 0), (0, 1)), "edge"), np.asarray(surface.faces[4])]
-    )
-    layer = js.RefinedSurface(
-        surface.vertices, surface.normals, choose_faces(surface.faces, known[corners].any(axis=1))
-    )
+    corners = [known[np.asarray(surface.faces[size])].any(axis=1) for size in (3, 4)]
+    layer = part_of(surface, np.concatenate(corners))
     view, values = js.view_of(layer), thickness.values
     back = view * np.array([[-1.0], [1.0], [-1.0]])
     low, high = np.percentile(values[known], [1, 99])

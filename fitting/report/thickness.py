@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 import jaxsubdiv as js
 
 from ..scan.closest_points import closest_points
-from ..scan.layers import choose_faces, rim_of
+from ..scan.layers import choose_faces, part_of, rim_of
 from .posterior import Posterior
 
 _RIM = 1e-3  # of a face: how near the other layer's rim there is no thickness
@@ -61,11 +61,8 @@ def find_gap(surface: js.RefinedSurface, layer: Bool[np.ndarray, "f"], other: Bo
         layer, other: the faces of each, triangles first.
     """
     vertices, rim = np.asarray(surface.vertices, np.float64), rim_of(surface, other)
-    used = [
-        np.unique(np.concatenate([f.ravel() for f in choose_faces(surface.faces, of).values()]))
-        for of in (layer, other)
-    ]
-    own = np.setdiff1d(*used)
+    used, others = (_used(surface, of) for of in (layer, other))
+    own = np.setdiff1d(used, others)
     at = closest_points(surface, vertices[own], js.FaceChoice(np.zeros(len(own), np.int32), other[None]))
     corners, weights = (np.asarray(part) for part in js.corner_weights(surface, at))
     there = np.sum(np.where(rim[corners], weights, 0), axis=1) <= 1 - _RIM
@@ -73,9 +70,13 @@ def find_gap(surface: js.RefinedSurface, layer: Bool[np.ndarray, "f"], other: Bo
     directions = np.asarray(js.evaluate(surface, at).normals, np.float64)[there]
     away = np.sum(weights[..., None] * vertices[corners], axis=1) - vertices[own]
     directions *= np.where(np.sum(directions * away) < 0, -1.0, 1.0)
-    of_layer = js.RefinedSurface(surface.vertices, surface.normals, choose_faces(surface.faces, layer))
-    areas = np.asarray(of_layer.vertex_areas(), np.float64)[own]
+    areas = np.asarray(part_of(surface, layer).vertex_areas(), np.float64)[own]
     return Gap(own, corners, weights.astype(np.float64), directions, areas / max(areas.sum(), np.finfo(float).tiny))
+
+
+def _used(surface: js.RefinedSurface, chosen: Bool[np.ndarray, "f"]) -> Int[np.ndarray, "u"]:
+    """The vertices of some faces."""
+    return np.unique(np.concatenate([rows.ravel() for rows in choose_faces(surface.faces, chosen).values()]))
 
 
 def measure_thickness(

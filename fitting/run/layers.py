@@ -22,8 +22,6 @@ from ..start.parts import PartKind
 from .fit_scan import ScanFit
 from .recipe import fit_scan
 
-_MOST_POINTS = 40_000  # of a layer from an image
-
 
 class LayeredScan(NamedTuple):
     """What a fit of layers starts from: made by `prepare_layers`."""
@@ -137,6 +135,7 @@ def scans_of_volume(volume: Volume, layers: LayerLabels) -> dict[str, Scan]:
     """The boundary of each layer in a label map: of all its labels together.
 
     A layer has the labels of all that lies inside of it: `{"bone": "femur", "cartilage": ["femur", "cartilage"]}`.
+    Such scans have many points; `fit_layers(..., most_points=40_000)` fits a part of them.
 
     Raises:
         ScanError: there is no such label; see `choose_label` and `scan_of_label`.
@@ -144,7 +143,7 @@ def scans_of_volume(volume: Volume, layers: LayerLabels) -> dict[str, Scan]:
     return {
         name: scan_of_label(
             volume, [choose_label(volume, one) for one in ([labels] if isinstance(labels, str) else labels)]
-        ).drawn(_MOST_POINTS)
+        )
         for name, labels in layers.items()
     }
 

@@ -72,9 +72,15 @@ def choose_faces(faces: Mapping[int, Any], chosen: np.ndarray) -> dict[int, np.n
     return {3: np.asarray(faces[3])[chosen[:n]], 4: np.asarray(faces[4])[chosen[n:]]}
 
 
+def part_of(surface: js.RefinedSurface, chosen: np.ndarray) -> js.RefinedSurface:
+    """A surface with some of its faces, and all of its vertices."""
+    faces: Any = choose_faces(surface.faces, chosen)
+    return js.RefinedSurface(surface.vertices, surface.normals, faces)
+
+
 def rim_of(surface: js.RefinedSurface, chosen: np.ndarray) -> np.ndarray:
     """Which vertices of a surface lie where its chosen faces end."""
-    return boundary_vertices(js.RefinedSurface(surface.vertices, surface.normals, choose_faces(surface.faces, chosen)))
+    return boundary_vertices(part_of(surface, chosen))
 
 
 def join_scans(scans: Mapping[str, Scan]) -> Scan:
