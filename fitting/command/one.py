@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import re
 import time
 import traceback
 from pathlib import Path
@@ -12,6 +13,7 @@ import jaxsubdiv as js
 from jaxsubdiv.console import printable
 
 from ..image.read import is_image
+from ..report.fit_measures import Measure
 from ..report.result import FitResult
 from ..report.saved import read_marks
 from ..run.checkpoint import differing
@@ -54,7 +56,7 @@ def _fit_and_save(scan: Source | None, folder: Path, options: argparse.Namespace
     if done is not None:
         print(f"done     before, in {folder}")
         print_warnings(done)
-        return make_row(title, done, misfit(done), None)
+        return make_row(title, done, misfit(done), None, options.details)
     if job.mesh is not None:
         counts = f"{len(job.mesh.vertices):,} vertices, {job.mesh.n_faces:,} faces"
         print(f"control  {counts}, {describe_size(job.mesh.vertices)}")
@@ -74,13 +76,13 @@ def _fit_and_save(scan: Source | None, folder: Path, options: argparse.Namespace
         )
     found = found if job.layered is None else job.layered.judge(found)
     seconds = time.perf_counter() - began
-    report, off = found.result.report(uncertainty=True), misfit(found.result)
+    report, off = found.result.report(uncertainty=True, details=options.details), misfit(found.result)
     print(f"done     in {seconds:.1f} s{describe_ending(found, off)}\n\n{dataclasses.replace(report, warnings=[])}\n")
     save_outputs(folder, found, title, marks, job, options)
     if job.seen is not None and job.mesh is None and (rims := topology_of(found.result.control_mesh).boundary_loops):
         print(f"note     the surface has {rims} rim{'s' * (rims > 1)}: past the end of the image nothing is known")
     print_warnings(found.result)
-    return make_row(title, found.result, off, seconds)
+    return make_row(title, found.result, off, seconds, options.details)
 
 
 def find_done(folder: Path, marks: dict[str, str]) -> FitResult | None:
@@ -101,7 +103,8 @@ def find_done(folder: Path, marks: dict[str, str]) -> FitResult | None:
     return load(folder)
 
 
-def make_row(name: str, result: FitResult, off: float, seconds: float | None) -> dict:
+def make_row(name: str, result: FitResult, off: float, seconds: float | None, details: bool) -> dict:
+    """The row of a fit in the summary: its state, and every measure with its standard deviation."""
     report = result.report()
     return {
         "scan": name,
@@ -114,4 +117,14 @@ def make_row(name: str, result: FitResult, off: float, seconds: float | None) ->
         "misfit_mm": f"{off:.4f}",
         "inlier_share": f"{report.inlier_share:.4f}",
         "warnings": " ".join(finding.name for finding in report.warnings),
-    }
+    } | _columns_of_measures(result.measures(details=details))
+
+
+def _columns_of_measures(measures: tuple[Measure, ...]) -> dict[str, str]:
+    """As `volume_ml` and `volume_sd_ml`."""
+    found = {}
+    for one in measures:
+        words = re.sub(r"[\W_]+", "_", one.name.replace("%", "")).strip("_")
+        unit = re.sub(r"\W+", "_", one.unit.replace("1/", "per "))
+        found |= {f"{words}_{unit}": f"{one.value:.6g}", f"{words}_sd_{unit}": f"{one.deviation:.3g}"}
+    return found

@@ -131,6 +131,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("--scheme", choices=tuple(SCHEMES), help="default: interpolating")
     add("--h", type=float, help="tangent length coefficient at the start, for schemes that have one (default: 1)")
     add("--max-sweeps", type=int, help=f"pairing and solving in turns (default: {Recipe.max_sweeps})")
+    add("--details", action="store_true", help="measure curvature, centre, moments of inertia and asymmetry, too")
     add(
         "--recipe", metavar="FILE", help="recipe.json of a fit: its settings; files, --scale and --labels are not in it"
     )

@@ -42,8 +42,10 @@ def save_outputs(
             for name in (LANDMARKS, CARRIED):
                 write_landmarks(new / name, there.positions, frame=frame, deviations=there.deviations)
                 written.append(name)
-        (new / "report.json").write_text(result.report(uncertainty=True).as_json() + "\n", encoding="utf-8")
-        write_page(new / "fit.html", result, title=title, start=found.start, slices=slices)
+        (new / "report.json").write_text(
+            result.report(uncertainty=True, details=options.details).as_json() + "\n", encoding="utf-8"
+        )
+        write_page(new / "fit.html", result, title=title, start=found.start, details=options.details, slices=slices)
         assert result.recipe is not None
         save_fit(new, result.fit, result.recipe, marks)
         try:
