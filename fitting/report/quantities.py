@@ -68,9 +68,9 @@ def measure_curvature(
 ) -> tuple[Float[Array, "v"], Float[Array, "v"]]:
     """Mean and Gaussian curvature at every vertex, by finite differences over the refined surface.
 
-    The normals follow from its faces, exactly on a ball, and the curvatures from how they turn along its edges. The curvature of
-    the interpolating scheme has no bound at control vertices: finer levels show larger ones there. On the level of a
-    fit it is a mean over an edge of that level.
+    The normals follow from its faces, exactly on a ball, and the curvatures from how they turn along its edges. The
+    curvature of the interpolating scheme has no bound at control vertices: finer levels show larger ones there. On the
+    level of a fit it is a mean over an edge of that level.
 
     Source: N. Max, Weights for computing vertex normals from facet normals, 1999 (normals).
     """

@@ -4,6 +4,7 @@ import os
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
+import jax.numpy as jnp
 import numpy as np
 
 import jaxsubdiv as js
@@ -74,7 +75,7 @@ def choose_faces(faces: Mapping[int, Any], chosen: np.ndarray) -> dict[int, np.n
 
 def part_of(surface: js.RefinedSurface, chosen: np.ndarray) -> js.RefinedSurface:
     """A surface with some of its faces, and all of its vertices."""
-    faces: Any = choose_faces(surface.faces, chosen)
+    faces = {size: jnp.asarray(rows) for size, rows in choose_faces(surface.faces, chosen).items()}
     return js.RefinedSurface(surface.vertices, surface.normals, faces)
 
 
