@@ -129,7 +129,9 @@ def test_deviations_of_thickness_are_those_of_the_covariance():
     for i, row in enumerate(rows):
         gradients[i, row] -= normals[i]
         np.add.at(gradients[i], corners[i], weights[i][:, None] * normals[i])
-    expected = np.sqrt(np.diag(posterior.covariance_of(gradients)))
+    misfit = found.result.uncertainty().misfit ** 2
+    of_both = misfit[rows] + np.sum(weights * misfit[corners], axis=1)
+    expected = np.sqrt(np.diag(posterior.covariance_of(gradients)) + of_both)
     np.testing.assert_allclose(known.deviations[rows], expected, rtol=4 / np.sqrt(2 * 512))
 
 

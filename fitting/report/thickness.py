@@ -22,6 +22,9 @@ class Gap(NamedTuple):
     """Of the surface, on the one layer; none on the other, nor where that ends."""
     corners: Int[np.ndarray, "w 4"]
     corner_weights: Float[np.ndarray, "w 4"]
+    """Of the place on the other layer that is closest to each."""
+    faces: Int[np.ndarray, "w"]
+    """Of the surface, where that place lies."""
     directions: Float[np.ndarray, "w 3"]
     """Unit normals of the other layer, all turned towards it from the one."""
     shares: Float[np.ndarray, "w"]
@@ -35,8 +38,8 @@ class Thickness(NamedTuple):
         layer, other: from which layer it is measured, and to which.
         values: distance across the other layer to its closest place in mm; negative where it lies on the wrong side.
             NaN at vertices of other layers, and where the other layer ends.
-        deviations: standard deviations in mm, posterior to scan and priors, to first order, from 512 random draws; NaN
-            likewise. The misfit of the control mesh is not in them.
+        deviations: standard deviations in mm; NaN likewise. Posterior to scan and priors, to first order, from 512
+            random draws, with the misfit of the control mesh on both layers (see `Uncertainty.misfit`).
         shares: of the area over which the thickness is known; 0 elsewhere.
     """
 
@@ -71,7 +74,10 @@ def find_gap(surface: js.RefinedSurface, layer: Bool[np.ndarray, "f"], other: Bo
     away = np.sum(weights[..., None] * vertices[corners], axis=1) - vertices[own]
     directions *= np.where(np.sum(directions * away) < 0, -1.0, 1.0)
     areas = np.asarray(part_of(surface, layer).vertex_areas(), np.float64)[own]
-    return Gap(own, corners, weights.astype(np.float64), directions, areas / max(areas.sum(), np.finfo(float).tiny))
+    faces = np.asarray(at.face)[there]
+    return Gap(
+        own, corners, weights.astype(np.float64), faces, directions, areas / max(areas.sum(), np.finfo(float).tiny)
+    )
 
 
 def _used(surface: js.RefinedSurface, chosen: Bool[np.ndarray, "f"]) -> Int[np.ndarray, "u"]:
@@ -93,18 +99,17 @@ def measure_thickness(
     vertices, gap = np.asarray(surface.vertices, np.float64), find_gap(surface, layer, other)
     n = len(vertices)
     values, deviations, shares = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n)
-    values[gap.vertices] = _across(gap, vertices[..., None])[:, 0]
+    beyond = np.sum(gap.corner_weights[..., None] * vertices[gap.corners], axis=1)
+    values[gap.vertices] = np.sum(gap.directions * (beyond - vertices[gap.vertices]), axis=1)
+    structure = posterior.equations.structure
+    there = gap.corners, gap.corner_weights, gap.directions, structure.patches.owner[gap.faces]
+    ones, of_own = np.ones((len(gap.vertices), 1)), structure.faces_of_vertices(n)[gap.vertices]
+    slopes = posterior.slopes_at(*there) - posterior.slopes_at(gap.vertices[:, None], ones, gap.directions, of_own)
     total = np.zeros(len(gap.vertices))
     for seed in range(_DRAWS // _DRAWS_AT_ONCE):
-        total += np.sum(_across(gap, posterior.displace(posterior.draws(_DRAWS_AT_ONCE, seed))) ** 2, axis=1)
-    deviations[gap.vertices] = np.sqrt(total / _DRAWS)
+        total += np.sum((slopes @ posterior.draws(_DRAWS_AT_ONCE, seed)) ** 2, axis=1)
+    misfit = posterior.uncertainty().misfit ** 2
+    of_both = misfit[gap.vertices] + np.sum(gap.corner_weights * misfit[gap.corners], axis=1)
+    deviations[gap.vertices] = np.sqrt(total / _DRAWS + of_both)
     shares[gap.vertices] = gap.shares
     return Thickness(*names, values, deviations, shares)
-
-
-def _across(gap: Gap, moved: Float[np.ndarray, "v 3 k"]) -> Float[np.ndarray, "w k"]:
-    """From every vertex of a gap to its place beyond, along its direction."""
-    found = -np.einsum("wx,wxk->wk", gap.directions, moved[gap.vertices])
-    for corner, weight in zip(gap.corners.T, gap.corner_weights.T, strict=True):
-        found += np.einsum("wx,wxk->wk", weight[:, None] * gap.directions, moved[corner])
-    return found
