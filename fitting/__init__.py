@@ -34,6 +34,7 @@ from .model.robust import geman_mcclure as geman_mcclure
 from .model.unknowns import Free as Free
 from .report.animation import animate_series as animate_series
 from .report.cohort import Cohort as Cohort
+from .report.fit_measures import CrossSection as CrossSection
 from .report.fit_measures import Measure as Measure
 from .report.layers import LayersFit as LayersFit
 from .report.page import write_page as write_page
