@@ -40,6 +40,7 @@ from ._padding import pad_control as pad_control
 from ._padding import pad_topology as pad_topology
 from ._padding import stack_topologies as stack_topologies
 from ._refine import refine as refine
+from ._refine import refine_levels as refine_levels
 from ._refine import refine_vertices as refine_vertices
 from ._regions import Regions as Regions
 from ._regions import as_regions as as_regions

@@ -16,13 +16,13 @@ from ._refine import refine
 from ._scheme.base import AbstractScheme, OldNormals
 from ._scheme.interpolating import Interpolating, Twist
 from ._topology import MAX_LEVELS, build_topology
-from .console import lasting_streams, plain_warnings
+from .console import simplify_warnings, survive_closed_streams
 from .errors import MeshError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; returns its exit status: 0, or 2 where the input or the arguments cannot be used."""
-    with lasting_streams(), plain_warnings():
+    with survive_closed_streams(), simplify_warnings():
         return _main(arguments)
 
 
@@ -42,7 +42,7 @@ def _main(arguments: Sequence[str] | None) -> int:
 def _run(options: argparse.Namespace) -> int:
     mesh = read_mesh(options.input, scale=options.scale, check=not options.repair)
     if options.repair:
-        mesh = mesh.repaired()
+        mesh = mesh.repair()
         for sentence in mesh.repairs:
             print(f"repaired: {sentence}")
     print(f"read     {options.input}: {_describe(mesh)}")

@@ -105,8 +105,8 @@ def test_a_given_strength_is_kept():
 def test_thickness_is_the_distance_across_the_other_layer():
     found, known = two_layers(), two_layers().thickness()
     assert (known.layer, known.other) == ("inner", "outer") and len(known.values) == len(found.result.surface.vertices)
-    values, deviations = (found.of_layer("inner", rows) for rows in (known.values, known.deviations))
-    assert np.isnan(found.of_layer("outer", known.values)).all()
+    values, deviations = (found.take_values("inner", rows) for rows in (known.values, known.deviations))
+    assert np.isnan(found.take_values("outer", known.values)).all()
     bottom = np.asarray(found.surface("inner").vertices)[:, 2] < 0
     np.testing.assert_allclose(values[bottom], GAP, atol=0.15)
     assert 0.3 < np.sqrt(np.mean((values[bottom] - GAP) ** 2) / np.mean(deviations[bottom] ** 2)) < 3
@@ -136,16 +136,16 @@ def test_deviations_of_thickness_are_those_of_the_covariance():
 
 
 def outer(found: fitting.LayersFit) -> np.ndarray:
-    return found.result.faces_of("outer")[None]
+    return found.result.find_faces("outer")[None]
 
 
 def test_measures_are_of_each_layer_and_of_what_lies_between():
     found = two_layers()
     rows = {one.name: one for one in found.result.measures()}
-    solids = [
-        trimesh.Trimesh(*map(np.asarray, (s.vertices, s.triangles())), process=False)
-        for s in map(found.surface, found.names)
-    ]
+    solids = []
+    for name in found.names:
+        vertices, triangles = found.surface(name).vertices, found.surface(name).triangles()
+        solids.append(trimesh.Trimesh(np.asarray(vertices), np.asarray(triangles), process=False))
     inside, whole = (solid.volume / 1e3 for solid in solids)
     np.testing.assert_allclose(rows["volume inner"].value, inside, rtol=1e-9)
     np.testing.assert_allclose(rows["volume between inner and outer"].value, whole - inside, rtol=1e-9)

@@ -171,11 +171,11 @@ def test_cross_section_is_that_of_trimesh_with_deviations():
         femur().cross_section((0, 0, 0), (0, 0, 0))
 
 
-def test_distances_and_angles_between_landmarks():
+def test_distances_and_angles_measure_landmarks():
     surface = femur().surface
     rows = [10, 300, 700]
     places = {name: np.asarray(surface.vertices)[row] for name, row in zip("abc", rows, strict=True)}
-    *distances, angle = femur().between_landmarks(places, [("a", "b", "c")])
+    *distances, angle = femur().measure_landmarks(places, [("a", "b", "c")])
     assert [one.name for one in distances] == ["distance a - b", "distance a - c", "distance b - c"]
 
     def numbers(s):
@@ -187,7 +187,7 @@ def test_distances_and_angles_between_landmarks():
     np.testing.assert_allclose([one.value for one in (*distances, angle)], numbers(surface), rtol=1e-6)
     assert_near([one.deviation for one in (*distances, angle)], spread_by_draws(numbers))
     with pytest.raises(ValueError, match="'d' is none of the landmarks a, b, c"):
-        femur().between_landmarks(places, [("a", "b", "d")])
+        femur().measure_landmarks(places, [("a", "b", "d")])
 
 
 def test_asymmetry_is_measured_where_the_fit_has_a_plane():

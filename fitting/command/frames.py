@@ -9,7 +9,7 @@ import jaxsubdiv as js
 from ..report.animation import animate_series
 from ..report.series import SeriesFit
 from ..report.series_page import write_series_page
-from ..run.folder import ANIMATION, PAGE_OF_SERIES, TABLE_OF_SERIES, filling, working_in
+from ..run.folder import ANIMATION, PAGE_OF_SERIES, TABLE_OF_SERIES, fill_folder, reserve_folder
 from ..run.names import name_folders
 from ..run.recipe import Recipe
 from ..run.series import fit_series
@@ -31,7 +31,7 @@ def fit_frames(scans: list[Source], options: argparse.Namespace, recipe: Recipe)
         for name, usual in _UNUSED.items():
             if getattr(options, name) != usual:
                 raise ValueError(f"--{name.replace('_', '-')} is not of a series: leave it out.")
-        with working_in(folder):
+        with reserve_folder(folder):
             return _fit_and_save(scans, folder, options, recipe)
     except REFUSALS as error:
         return report_failure(error)
@@ -79,7 +79,7 @@ def _save(folder: Path, found: SeriesFit) -> None:
     for number, name in enumerate(found.names):
         js.write_mesh(frames / f"{name}.obj", found.control_mesh(number), frame=found.result.scan.frame)
         js.write_mesh(frames / f"{name}.ply", found.surface(number), frame=found.result.scan.frame)
-    with filling(folder) as new:
+    with fill_folder(folder) as new:
         found.save(new)
         found.table.write_csv(new / TABLE_OF_SERIES)
         animation = None

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 import jaxsubdiv as js
-from jaxsubdiv.frames import Frame, in_frame
+from jaxsubdiv.frames import Frame, convert_frame
 
 from ..image.boundary import suggest_settings
 from ..image.read import Seen, is_image, read_labels, read_scan, read_seen, read_volume, stem
@@ -156,8 +156,8 @@ def _read_template(
     if of_scan is None or own == of_scan:
         return mesh, own
     print(f"note     the control mesh was turned from {own}, as its file says, to the scan's {of_scan}")
-    normals = None if mesh.normals is None else in_frame(mesh.normals, own, of_scan)
-    turned = in_frame(mesh.vertices, own, of_scan)
+    normals = None if mesh.normals is None else convert_frame(mesh.normals, own, of_scan)
+    turned = convert_frame(mesh.vertices, own, of_scan)
     return js.ControlMesh(turned, mesh.faces, normals, regions=mesh.regions), of_scan
 
 

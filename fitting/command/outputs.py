@@ -17,7 +17,7 @@ from ..report.result import FitResult
 from ..report.saved import save_fit
 from ..run.carry import carry_landmarks
 from ..run.fit_scan import ScanFit
-from ..run.folder import CARRIED, LANDMARKS, filling
+from ..run.folder import CARRIED, LANDMARKS, fill_folder
 from ..run.surface_files import write_surface
 from ..scan.landmarks import write_landmarks
 from .inputs import Job
@@ -33,7 +33,7 @@ def save_outputs(
     slices = cut_job_slices(job, result)
     if result.layers:
         _write_layers(folder / _LAYERS, LayersFit(result), options, frame)
-    with filling(folder) as new:
+    with fill_folder(folder) as new:
         js.write_mesh(new / "control.obj", result.control_mesh, frame=frame)
         written = ["control.obj", *_write_surface(new, result, options, frame)]
         written += ["report.json", "fit.html", "fit.npz", "recipe.json"]
@@ -59,7 +59,7 @@ def save_outputs(
 def _write_layers(folder: Path, found: LayersFit, options: argparse.Namespace, frame: Frame | None) -> None:
     """Every layer's control mesh and surface, and what lies between it and the next, as values and as a picture."""
     folder.mkdir(exist_ok=True)
-    at = found.result.at_level()
+    at = found.result.refine_to()
     for number, name in enumerate(found.names):
         thickness = found.thickness(name)
         of_surface = {
@@ -68,7 +68,7 @@ def _write_layers(folder: Path, found: LayersFit, options: argparse.Namespace, f
             "thickness_mm": thickness.values,
             "thickness_deviation_mm": thickness.deviations,
         }
-        values = {word: found.of_layer(name, numbers) for word, numbers in of_surface.items()}
+        values = {word: found.take_values(name, numbers) for word, numbers in of_surface.items()}
         js.write_mesh(folder / f"{name}_control.obj", found.control_mesh(name), frame=frame)
         written = write_surface(folder, found.surface(name), values, options.surface, frame, name)
         if number + 1 < len(found.names) and (thickness.shares > 0).any():
@@ -83,7 +83,7 @@ def _write_layers(folder: Path, found: LayersFit, options: argparse.Namespace, f
 def _write_surface(folder: Path, result: FitResult, options: argparse.Namespace, frame: Frame | None) -> list[str]:
     """The surface's files; where it has no such level, told, none: the fit itself is not lost."""
     try:
-        at = result.at_level(options.surface_level)
+        at = result.refine_to(options.surface_level)
         values = {"distance_mm": at.distances, "deviation_mm": at.deviations}
         return write_surface(folder, at.surface, values, options.surface, frame)
     except (ValueError, MemoryError) as error:

@@ -149,7 +149,7 @@ def measure_details(posterior: Posterior) -> tuple[Measure, ...]:
 def measure_landmarks(
     posterior: Posterior, landmarks: Mapping[str, Numbers], angles: Sequence[tuple[str, str, str]] = ()
 ) -> tuple[Measure, ...]:
-    """Distances between landmarks on the surface of a fit, and angles at them; see `FitResult.between_landmarks`."""
+    """Distances between landmarks on the surface of a fit, and angles at them; see `FitResult.measure_landmarks`."""
     names, surface = list(landmarks), posterior.fit.surface()
     lost = sorted({name for angle in angles for name in angle} - set(names))
     if lost or len(names) < 2:

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 import jaxsubdiv as js
 
-from ..scan.layers import faces_between, take_layer
+from ..scan.layers import take_faces, take_layer
 from .result import FitResult
 from .thickness import Thickness
 
@@ -54,12 +54,12 @@ class LayersFit:
         tables = {size: jnp.asarray(rows) for size, rows in faces.items()}
         return js.RefinedSurface(surface.vertices[vertices], surface.normals[vertices], tables)
 
-    def of_layer(self, name: str, values: Float[np.ndarray, "v"]) -> Float[np.ndarray, "w"]:
+    def take_values(self, name: str, values: Float[np.ndarray, "v"]) -> Float[np.ndarray, "w"]:
         """Values at the vertices of `result.surface`, of those of one layer in the order of `surface(name)`."""
         return values[self._places(name)[0]]
 
     def _places(self, name: str) -> tuple[Int[np.ndarray, "w"], dict[int, np.ndarray]]:
-        return faces_between(self.result.surface.faces, self.result.faces_of(name))
+        return take_faces(self.result.surface.faces, self.result.find_faces(name))
 
     def thickness(self, layer: str | None = None, other: str | None = None) -> Thickness:
         """How thick what lies between two layers is, at every vertex of one of them; see `FitResult.thickness`.

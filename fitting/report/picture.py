@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Float
 
 import jaxsubdiv as js
-from jaxsubdiv.console import printable
+from jaxsubdiv.console import make_printable
+from jaxsubdiv.extras import import_extra
 
 from ..image.slices import Slice
-from ..scan.layers import part_of
+from ..scan.layers import take_part
 from .result import FitResult
 from .thickness import Thickness
 
@@ -38,7 +39,7 @@ def draw_fit(result: FitResult, start: js.ControlMesh, *, title: str = "", slice
         ImportError: matplotlib is missing; it comes with the extra `viz`.
     """
     figure = make_figure(15.0, 14.25 if slices else 9.5)
-    figure.suptitle(printable(title), fontsize=14, parse_math=False)  # a `$` in a name is no formula
+    figure.suptitle(make_printable(title), fontsize=14, parse_math=False)  # a `$` in a name is no formula
     (before, after, smooth), (error, counts, convergence), *below = figure.subplots(3 if slices else 2, 3)
     view, surface = js.view_of(result.surface), result.surface
     for ax, vertices, name in (
@@ -75,10 +76,10 @@ def draw_thickness(surface: js.RefinedSurface, thickness: Thickness, *, title: s
         ImportError: matplotlib is missing; it comes with the extra `viz`.
     """
     figure = make_figure(15.0, 9.5)
-    figure.suptitle(printable(title) or f"{thickness.layer} to {thickness.other}", fontsize=14, parse_math=False)
+    figure.suptitle(make_printable(title) or f"{thickness.layer} to {thickness.other}", fontsize=14, parse_math=False)
     known = thickness.shares > 0
     corners = [known[np.asarray(surface.faces[size])].any(axis=1) for size in (3, 4)]
-    layer = part_of(surface, np.concatenate(corners))
+    layer = take_part(surface, np.concatenate(corners))
     view, values = js.view_of(layer), thickness.values
     back = view * np.array([[-1.0], [1.0], [-1.0]])
     low, high = np.percentile(values[known], [1, 99])
@@ -113,7 +114,7 @@ def draw_slices(result: FitResult, slices: Sequence[Slice]) -> "Figure":
     return figure
 
 
-def as_png(figure: "Figure") -> bytes:
+def encode_png(figure: "Figure") -> bytes:
     """A figure as the bytes of a PNG file."""
     file = io.BytesIO()
     figure.savefig(file, format="png")
@@ -121,10 +122,8 @@ def as_png(figure: "Figure") -> bytes:
 
 
 def make_figure(width: float, height: float) -> "Figure":
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError("pictures need matplotlib: pip install 'jaxsubdiv[viz]'") from error
+    import_extra("matplotlib", "viz", "pictures")
+    from matplotlib.figure import Figure
 
     class Picture(Figure):
         """A figure that notebooks show where pyplot, which would tell them how, was never imported."""
@@ -135,7 +134,7 @@ def make_figure(width: float, height: float) -> "Figure":
                 super().draw(renderer)
 
         def _repr_png_(self) -> bytes:
-            return as_png(self)
+            return encode_png(self)
 
     return Picture(figsize=(width, height), layout="constrained", dpi=100)
 
@@ -153,7 +152,7 @@ def _draw_slice(ax: Any, one: Slice, surface: js.RefinedSurface) -> None:
 
 def _draw_error(ax: Any, result: FitResult, view: Float[np.ndarray, "3 3"]) -> None:
     limit = _limit(result, 98.0)
-    distances = result.at_level().distances
+    distances = result.refine_to().distances
     colours = js.draw_surface(ax, result.surface, view=view, values=distances, limits=(-limit, limit), cmap=_COLOURS)
     ax.set_title("distance of the scan from it")
     below = ax.inset_axes((0.1, -0.08, 0.8, 0.03))

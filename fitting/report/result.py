@@ -99,7 +99,7 @@ class FitResult:
         """
         return self.posterior.uncertainty()
 
-    def at_level(self, levels: int | None = None) -> SurfaceAtLevel:
+    def refine_to(self, levels: int | None = None) -> SurfaceAtLevel:
         """The surface at another level of refinement, with the scan's distances and the uncertainty at its vertices.
 
         Args:
@@ -176,7 +176,7 @@ class FitResult:
         """
         return measure_cross_section(self.posterior, origin, normal)
 
-    def between_landmarks(
+    def measure_landmarks(
         self, landmarks: Mapping[str, Numbers], angles: Sequence[tuple[str, str, str]] = ()
     ) -> tuple[Measure, ...]:
         """Distances between landmarks on the surface, all pairs, and angles, with standard deviations.
@@ -203,7 +203,7 @@ class FitResult:
         """Names of the regions that were fitted as layers, from the inside out; none of other fits."""
         return self.fit.inputs.get("layers") or ()
 
-    def faces_of(self, region: str) -> Bool[np.ndarray, "f"]:
+    def find_faces(self, region: str) -> Bool[np.ndarray, "f"]:
         """Which faces of the refined surface lie in a region of the control mesh, triangles first.
 
         Raises:
@@ -226,7 +226,7 @@ class FitResult:
         Raises:
             ValueError: there is no such region.
         """
-        return measure_thickness(self.posterior, (region, other), self.faces_of(region), self.faces_of(other))
+        return measure_thickness(self.posterior, (region, other), self.find_faces(region), self.find_faces(other))
 
     @functools.cached_property
     def control_mesh(self) -> js.ControlMesh:
@@ -250,7 +250,7 @@ class FitResult:
             )
         return make_refit(self.posterior)
 
-    def on(self, scan: Scan) -> "FitResult":
+    def compare_with(self, scan: Scan) -> "FitResult":
         """The same surface, measured by another scan: by all points of the one of which a part was fitted, say.
 
         Correspondences, distances, noise, report and uncertainty are those of its points; the convergence is that of

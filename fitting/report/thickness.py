@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 import jaxsubdiv as js
 
 from ..scan.closest_points import closest_points
-from ..scan.layers import choose_faces, part_of, rim_of
+from ..scan.layers import choose_faces, find_rim, take_part
 from .posterior import Posterior
 
 _RIM = 1e-3  # of a face: how near the other layer's rim there is no thickness
@@ -63,7 +63,7 @@ def find_gap(surface: js.RefinedSurface, layer: Bool[np.ndarray, "f"], other: Bo
         surface: of all layers.
         layer, other: the faces of each, triangles first.
     """
-    vertices, rim = np.asarray(surface.vertices, np.float64), rim_of(surface, other)
+    vertices, rim = np.asarray(surface.vertices, np.float64), find_rim(surface, other)
     used, others = (_used(surface, of) for of in (layer, other))
     own = np.setdiff1d(used, others)
     at = closest_points(surface, vertices[own], js.FaceChoice(np.zeros(len(own), np.int32), other[None]))
@@ -73,7 +73,7 @@ def find_gap(surface: js.RefinedSurface, layer: Bool[np.ndarray, "f"], other: Bo
     directions = np.asarray(js.evaluate(surface, at).normals, np.float64)[there]
     away = np.sum(weights[..., None] * vertices[corners], axis=1) - vertices[own]
     directions *= np.where(np.sum(directions * away) < 0, -1.0, 1.0)
-    areas = np.asarray(part_of(surface, layer).vertex_areas(), np.float64)[own]
+    areas = np.asarray(take_part(surface, layer).vertex_areas(), np.float64)[own]
     faces = np.asarray(at.face)[there]
     return Gap(
         own, corners, weights.astype(np.float64), faces, directions, areas / max(areas.sum(), np.finfo(float).tiny)
@@ -104,7 +104,7 @@ def measure_thickness(
     structure = posterior.equations.structure
     there = gap.corners, gap.corner_weights, gap.directions, structure.patches.owner[gap.faces]
     ones, of_own = np.ones((len(gap.vertices), 1)), structure.faces_of_vertices(n)[gap.vertices]
-    slopes = posterior.slopes_at(*there) - posterior.slopes_at(gap.vertices[:, None], ones, gap.directions, of_own)
+    slopes = posterior.find_slopes(*there) - posterior.find_slopes(gap.vertices[:, None], ones, gap.directions, of_own)
     total = np.zeros(len(gap.vertices))
     for seed in range(_DRAWS // _DRAWS_AT_ONCE):
         total += np.sum((slopes @ posterior.draws(_DRAWS_AT_ONCE, seed)) ** 2, axis=1)

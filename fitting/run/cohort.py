@@ -103,7 +103,7 @@ def fit_cohort(
     check_numbers({"at_once": at_once})
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
     n = len(scans)
-    controls = _one_each(controls, js.Control, n, "controls")
+    controls = _check_one_each(controls, js.Control, n, "controls")
     for i, (control, scan) in enumerate(zip(controls, scans, strict=True)):
         try:
             check(scheme, topology, control, scan)
@@ -118,9 +118,9 @@ def fit_cohort(
             sound[id(control)] = sound_start(scheme, topology, control, free)
     controls = [sound[id(control)] for control in controls]
     named = name_subjects(n, names)
-    places = [None] * n if landmarks is None else _one_each(landmarks, Landmarks, n, "landmarks")
-    curves = [None] * n if boundary is None else _one_each(boundary, BoundaryCurve, n, "boundaries")
-    matches = [None] * n if regions is None else _one_each(regions, RegionMatch, n, "regions")
+    places = [None] * n if landmarks is None else _check_one_each(landmarks, Landmarks, n, "landmarks")
+    curves = [None] * n if boundary is None else _check_one_each(boundary, BoundaryCurve, n, "boundaries")
+    matches = [None] * n if regions is None else _check_one_each(regions, RegionMatch, n, "regions")
     for match in matches:
         check_regions(match, topology)
     partners = find_partners(symmetry, priors, topology, controls[0])
@@ -170,7 +170,7 @@ def fit_cohort(
     values, states = jax.tree.map(lambda rows: rows[:n], _run(solver, shared, own, at_once))
     surfaces = jax.vmap(lambda y: subjects[0][0].refine(y))(values)
     rows_of, states = jax.tree.map(np.asarray, (values, states))  # rows of JAX arrays would be one program each
-    ends = [_end_of(models[i], scenes[i], jax.tree.map(lambda rows, i=i: rows[i], states)) for i in range(n)]
+    ends = [_find_ending(models[i], scenes[i], jax.tree.map(lambda rows, i=i: rows[i], states)) for i in range(n)]
     converged = np.array([bool(end == optx.RESULTS.successful) for end in ends])
     if not converged.all():
         which = np.flatnonzero(~converged)
@@ -222,16 +222,16 @@ def find_targets(model: Model, priors: Priors, pilot: FitResult | None) -> FromT
 
 @eqx.filter_jit
 def _run(solver: Sweeps, shared: Any, own: Any, at_once: int) -> tuple[Variables, State]:
-    def one(own: Any) -> tuple[Variables, State]:
+    def fit_one(own: Any) -> tuple[Variables, State]:
         model, scene, y = eqx.combine(shared, own)
         subject = Subject(model, scene)
         found = optx.least_squares(subject_residual, solver, y, subject, max_steps=None, throw=False)
         return found.value, found.stats["state"]
 
-    return lax.map(one, own, batch_size=None if at_once == 1 else at_once)
+    return lax.map(fit_one, own, batch_size=None if at_once == 1 else at_once)
 
 
-def _end_of(model: Model, scene: Scene, state: State) -> optx.RESULTS:
+def _find_ending(model: Model, scene: Scene, state: State) -> optx.RESULTS:
     """Why a subject's fit ended. One that nothing moved from far off has come to rest, and has not converged."""
     if state.status != CONVERGED:
         return optx.RESULTS.nonfinite if state.status == NONFINITE else optx.RESULTS.nonlinear_max_steps_reached
@@ -240,7 +240,7 @@ def _end_of(model: Model, scene: Scene, state: State) -> optx.RESULTS:
     return optx.RESULTS.successful
 
 
-def _one_each(given: _T | Sequence[_T], kind: type, n: int, name: str) -> list[_T]:
+def _check_one_each(given: _T | Sequence[_T], kind: type, n: int, name: str) -> list[_T]:
     """One for each scan."""
     values = [given] * n if isinstance(given, kind) else list(given)  # pyright: ignore[reportArgumentType]
     if len(values) != n or not n:

@@ -118,13 +118,13 @@ def fit_series(
     say(f"fits {n} frames, {n * len(mesh.vertices):,} control vertices")
     whole = copy_mesh(mesh, frames)
     tables = js.build_topology(js.ControlMesh(whole.vertices, whole.faces), scheme, levels)
-    control = js.Control(jnp.asarray(frames.copies(np.asarray(first.vertices))), jnp.tile(first.normals, (n, 1)))
+    control = js.Control(jnp.asarray(frames.copy_rows(np.asarray(first.vertices))), jnp.tile(first.normals, (n, 1)))
     check(scheme, tables, control, scan)
     control = sound_start(scheme, tables, control, free)
     inputs = gather_inputs(scheme, tables, control, scan, free, None, 1.0, None)
     match = match_regions(scan, whole, regions)
     inputs |= {"regions": match, "frames": frames}
-    inputs["slices"] = find_slice_planes(frames.in_place(scan)) if free.shifts else None
+    inputs["slices"] = find_slice_planes(frames.place_back(scan)) if free.shifts else None
     inputs["valves"], scan = _take_valve_points(scan, mesh, match, valves, valve_deviation, inputs["slices"], n)
     model, y = analyse(scheme, tables, control, free, priors, inputs)
     y = _start_at(pilot, y, frames)
@@ -165,15 +165,15 @@ def _take_valve_points(
         return None, scan
     region = np.array(mesh.regions.words() if mesh.regions is not None else [])
 
-    def copied(faces: Bool[np.ndarray, "f"]) -> Bool[np.ndarray, "g"]:
+    def copy_faces(faces: Bool[np.ndarray, "f"]) -> Bool[np.ndarray, "g"]:
         return copies_of_faces(faces, mesh.faces[3], n)
 
     given = ValvePoints(
         np.asarray(scan.points, np.float64)[rows],
         (np.full(scan.n_points, -1) if planes is None else planes.rows_of(scan))[rows],
         np.array([names.index(valve_of[word]) for word, is_valve in zip(words, rows, strict=True) if is_valve]),
-        np.stack([copied(region == name) for name in names]),
-        copied(np.any([part.faces for part in beside], axis=0)),
+        np.stack([copy_faces(region == name) for name in names]),
+        copy_faces(np.any([part.faces for part in beside], axis=0)),
         deviation,
     )
     weights = np.where(rows, 0.0, np.asarray(scan.weights_or_ones()))
@@ -189,7 +189,7 @@ def _start_at(pilot: FitResult, y: Variables, frames: Frames) -> Variables:
     normals = jnp.tile(pilot.control.normals, (len(frames.counts), 1))
     own = pilot.fit.y.shared
     shared = {name: own[name] if name in own and name == "h" else value for name, value in y.shared.items()}
-    return Variables(js.Control(jnp.asarray(frames.copies(vertices)), normals), shared)
+    return Variables(js.Control(jnp.asarray(frames.copy_rows(vertices)), normals), shared)
 
 
 def _common_motion(result: FitResult) -> Float[np.ndarray, "3"]:

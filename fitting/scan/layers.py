@@ -47,20 +47,20 @@ def take_layer(mesh: js.ControlMesh, name: str) -> js.ControlMesh:
     Raises:
         ValueError: the mesh has no such region.
     """
-    vertices, faces = layer_faces(mesh, name)
+    vertices, faces = take_layer_faces(mesh, name)
     normals = None if mesh.normals is None else mesh.normals[vertices]
     return js.ControlMesh(mesh.vertices[vertices], faces, normals, check=False)
 
 
-def layer_faces(mesh: js.ControlMesh, name: str) -> tuple[np.ndarray, dict[int, np.ndarray]]:
+def take_layer_faces(mesh: js.ControlMesh, name: str) -> tuple[np.ndarray, dict[int, np.ndarray]]:
     """The vertices that the faces of a region use, and those faces between them."""
     if mesh.regions is None or name not in mesh.regions.names:
         there = () if mesh.regions is None else mesh.regions.names
         raise ValueError(f"'{name}' is no region of the control mesh; it has {', '.join(there) or 'none'}.")
-    return faces_between(mesh.faces, mesh.regions.rows == mesh.regions.names.index(name))
+    return take_faces(mesh.faces, mesh.regions.rows == mesh.regions.names.index(name))
 
 
-def faces_between(faces: Mapping[int, Any], chosen: np.ndarray) -> tuple[np.ndarray, dict[int, np.ndarray]]:
+def take_faces(faces: Mapping[int, Any], chosen: np.ndarray) -> tuple[np.ndarray, dict[int, np.ndarray]]:
     """The vertices that chosen faces use, triangles being marked first, and the faces in the numbers of these."""
     kept = choose_faces(faces, chosen)
     vertices = np.unique(np.concatenate([rows.ravel() for rows in kept.values()]))
@@ -73,15 +73,15 @@ def choose_faces(faces: Mapping[int, Any], chosen: np.ndarray) -> dict[int, np.n
     return {3: np.asarray(faces[3])[chosen[:n]], 4: np.asarray(faces[4])[chosen[n:]]}
 
 
-def part_of(surface: js.RefinedSurface, chosen: np.ndarray) -> js.RefinedSurface:
+def take_part(surface: js.RefinedSurface, chosen: np.ndarray) -> js.RefinedSurface:
     """A surface with some of its faces, and all of its vertices."""
     faces = {size: jnp.asarray(rows) for size, rows in choose_faces(surface.faces, chosen).items()}
     return js.RefinedSurface(surface.vertices, surface.normals, faces)
 
 
-def rim_of(surface: js.RefinedSurface, chosen: np.ndarray) -> np.ndarray:
+def find_rim(surface: js.RefinedSurface, chosen: np.ndarray) -> np.ndarray:
     """Which vertices of a surface lie where its chosen faces end."""
-    return boundary_vertices(part_of(surface, chosen))
+    return boundary_vertices(take_part(surface, chosen))
 
 
 def join_scans(scans: Mapping[str, Scan]) -> Scan:

@@ -12,7 +12,7 @@ import jaxsubdiv as js
 from jaxsubdiv.linalg import dot, take
 
 from ...scan.closest_points import closest_points
-from ...scan.layers import rim_of
+from ...scan.layers import find_rim
 from ...scan.regions import RegionMatch
 from ..unknowns import AnyArray
 from .base import AbstractVertexPrior, Place, Start, backend
@@ -84,7 +84,7 @@ class ThicknessPrior(AbstractVertexPrior):
             at = closest_points(flat, np.asarray(start.control.vertices)[own], to)
             corners, weights = (np.asarray(part) for part in js.corner_weights(flat, at))
             shared = np.isin(own, np.unique(faces[of_control[b]]))  # where the layers meet
-            on_rim = np.sum(np.where(rim_of(flat, of_control[b])[corners], weights, 0), axis=1) > 1 - _RIM
+            on_rim = np.sum(np.where(find_rim(flat, of_control[b])[corners], weights, 0), axis=1) > 1 - _RIM
             there = ~(on_rim | shared)
             found.append((own[there], np.full(there.sum(), b), corners[there], weights[there]))
         own, other, corners, weights = (np.concatenate(parts) for parts in zip(*found, strict=True))
