@@ -34,10 +34,13 @@ from .model.robust import geman_mcclure as geman_mcclure
 from .model.unknowns import Free as Free
 from .report.animation import animate_series as animate_series
 from .report.cohort import Cohort as Cohort
+from .report.fit_measures import CrossSection as CrossSection
 from .report.fit_measures import Measure as Measure
+from .report.layers import LayersFit as LayersFit
 from .report.page import write_page as write_page
 from .report.picture import draw_fit as draw_fit
 from .report.picture import draw_slices as draw_slices
+from .report.picture import draw_thickness as draw_thickness
 from .report.posterior import Uncertainty as Uncertainty
 from .report.refit import Refit as Refit
 from .report.report import Report as Report
@@ -47,6 +50,7 @@ from .report.series import SeriesFit as SeriesFit
 from .report.series import load_series as load_series
 from .report.series_page import write_series_page as write_series_page
 from .report.series_table import SeriesTable as SeriesTable
+from .report.thickness import Thickness as Thickness
 from .run.carry import CarriedLandmarks as CarriedLandmarks
 from .run.carry import carry_landmarks as carry_landmarks
 from .run.carry import carry_to_cohort as carry_to_cohort
@@ -54,6 +58,8 @@ from .run.cohort import fit_cohort as fit_cohort
 from .run.fit import Sweep as Sweep
 from .run.fit_scan import ScanFit as ScanFit
 from .run.fit_scan import misfit as misfit
+from .run.layers import fit_layers as fit_layers
+from .run.layers import scans_of_volume as scans_of_volume
 from .run.recipe import Recipe as Recipe
 from .run.recipe import fit as fit
 from .run.recipe import fit_scan as fit_scan

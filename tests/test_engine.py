@@ -35,6 +35,8 @@ from fitting.model.priors.valves import ValvePoints
 from fitting.model.procrustes import align_shape
 from fitting.run.fit import sound_start
 from fitting.scan.frames import Frames
+from fitting.scan.layers import stack_meshes
+from fitting.scan.regions import RegionMatch
 from fitting.solve import sweeps
 from fitting.solve.conjugate_gradients import ConjugateGradients
 from fitting.solve.strengths import FromScan, first_strengths
@@ -281,8 +283,11 @@ def test_shapes_of_another_mesh_are_refused():
 def derivatives() -> tuple[dict, dict, dict, dict]:
     """Of the rows of all priors at a random place: in forward mode, by differences, the weights of sums of rows, and
     the gradients of these sums in reverse mode."""
-    vertices, faces = meshes.grid(2, 2, "quad")
-    mesh, rng = js.ControlMesh(10.0 * vertices, faces), np.random.default_rng(0)
+    sheet = js.ControlMesh(*meshes.grid(3, 2, "quad"))
+    above = js.ControlMesh(sheet.vertices + [0.0, 0.0, 0.5], sheet.faces)
+    stacked = stack_meshes({"lower": sheet, "upper": above})
+    vertices, regions = stacked.vertices, stacked.regions
+    mesh, rng = js.ControlMesh(10.0 * vertices, stacked.faces), np.random.default_rng(0)
     scheme, n = js.Interpolating(), len(vertices)
     topology = js.build_topology(mesh, scheme, 1)
     start = mesh.control()
@@ -296,7 +301,9 @@ def derivatives() -> tuple[dict, dict, dict, dict]:
         "slices": SlicePlanes(np.arange(2), np.tile(np.eye(3)[:2], (2, 1, 1))),
         "frames": Frames(rng.normal(size=(3, 3)), np.ones(3, int), True),
     }
-    upper, lower = np.array([True, True, False, False]), np.array([False, False, True, True])
+    assert regions is not None
+    inputs |= {"regions": RegionMatch(regions, ()), "layers": regions.names}
+    upper, lower = (np.isin(np.arange(12), rows) for rows in ((0, 1, 2), (3, 4, 5)))
     slices = np.array([0, 1, -1])
     inputs["valves"] = ValvePoints(rng.normal(size=(3, 3)), slices, np.zeros(3, int), upper[None], lower)
     model, y = analysed(scheme, topology, control, priors=Priors(shape=family, symmetry=1.0), **inputs)

@@ -11,14 +11,16 @@ import jaxsubdiv as js
 from jaxsubdiv.frames import Frame, convert_frame
 
 from ..image.boundary import suggest_settings
-from ..image.read import Seen, is_image, read_labels, read_scan, read_seen, stem
+from ..image.read import Seen, is_image, read_labels, read_scan, read_seen, read_volume, stem
 from ..image.volume import Label
 from ..model.priors.boundary import BoundaryCurve, boundary_of
 from ..run.checkpoint import marks_of
+from ..run.layers import LayeredScan, prepare_layers, scans_of_volume
 from ..run.names import find_scans
 from ..run.recipe import Recipe, find_fits, load
 from ..scan.example import example
 from ..scan.landmarks import FramedLandmarks, Landmarks, match_landmarks, read_framed_landmarks, read_landmarks
+from ..scan.layers import read_layers
 from ..scan.regions import Groups, match_regions, read_groups
 from ..scan.scan import Scan
 
@@ -59,6 +61,8 @@ class Job(NamedTuple):
     carried: FramedLandmarks | None = None
     """Places on the control mesh, to be carried to the fit."""
     regions: Groups | None = None
+    layered: LayeredScan | None = None
+    """Where several layers are fitted at once: scan and control mesh are those of all of them."""
 
 
 def find_sources(options: argparse.Namespace) -> list[Source]:
@@ -86,6 +90,8 @@ def read_inputs(scan: Source | None, options: argparse.Namespace, recipe: Recipe
         noise = np.random.default_rng(0).normal(scale=_EXAMPLE_NOISE, size=mesh.vertices.shape)
         return Job(options.example, points, js.ControlMesh(mesh.vertices + noise, mesh.faces, mesh.normals), None)
     file, seen = scan.path, None
+    if options.layers is not None:
+        return _read_layers(scan, options, recipe)
     if is_image(file) and not options.labels:
         seen = read_seen(file, scale=options.scale, label=scan.label, above=options.above)
         points = seen.scan
@@ -119,6 +125,23 @@ def read_inputs(scan: Source | None, options: argparse.Namespace, recipe: Recipe
     elif options.boundary is not None:
         boundary = BoundaryCurve(js.read_points(options.boundary, scale=options.scale).points)
     return Job(scan.title(), points, mesh, landmarks, boundary, seen, carried, regions)
+
+
+def _read_layers(scan: Source, options: argparse.Namespace, recipe: Recipe) -> Job:
+    """The layers that a file names, of a table with labels or of a label map."""
+    layers, faces = read_layers(options.layers), recipe.faces
+    if is_image(scan.path):
+        points = scans_of_volume(read_volume(scan.path, scale=options.scale), layers)
+        frame, labels = next(iter(points.values())).frame, None
+        if options.faces is None and options.recipe is None:
+            faces = max(suggest_settings(one)["faces"] for one in points.values())
+    else:
+        points = read_scan(scan.path, scale=options.scale)
+        frame, labels = points.frame, layers
+    mesh = None if options.control is None else _read_template(options, recipe, frame)[0]
+    how = {"kind": recipe.kind, "closed": recipe.closed, "part": recipe.part}
+    layered = prepare_layers(points, mesh, labels, faces=faces, **how)
+    return Job(scan.title(), layered.scan, layered.mesh, None, layered=layered)
 
 
 def _read_template(
@@ -162,6 +185,7 @@ def mark_job(job: Job, recipe: Recipe, options: argparse.Namespace) -> dict[str,
         inputs["regions"] = match, job.scan.regions  # labels that no fit looks at are none of its inputs
     inputs["control mesh"] = None if job.mesh is None else (job.mesh.vertices, job.mesh.faces, job.mesh.normals)
     inputs |= {"landmarks": job.landmarks, "boundary": job.boundary}
+    inputs |= {} if job.layered is None else {"layers": job.layered.names}
     inputs |= {} if job.carried is None else {"carried landmarks": job.carried}
     if (options.surface, options.surface_level) != (["ply"], None):
         inputs["surface format or level"] = options.surface, options.surface_level

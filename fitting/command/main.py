@@ -39,6 +39,10 @@ def _main(arguments: Sequence[str] | None) -> int:
         parser.error("--periodic and --valves are of frames: give --series")
     if options.series and not options.control:
         parser.error("--series fits a template to all frames: give --control MESH")
+    if options.layers and (options.series or options.template_out or not options.scans):
+        parser.error(
+            "--layers is of scans that are fitted one by one: give SCAN, and neither --series nor --template-out"
+        )
     if options.template_out and (options.control or options.prior or not options.scans):
         parser.error("--template-out makes a template of scans: give scans, and neither --control nor --prior")
     keep_compiled_programs()

@@ -43,7 +43,8 @@ def fit_all(scans: list[Source], options: argparse.Namespace, recipe: Recipe) ->
             for number, (scan, title, name) in enumerate(zip(scans, titles, folders, strict=True), 1):
                 print(f"\n[{number}/{len(scans)}] {scan.title(whole=True)}")
                 rows.append(fit_one(scan, parent / name, options, recipe, title))
-                summary = _format_csv(rows, _COLUMNS)
+                measured = [column for row in rows for column in row if column not in _COLUMNS]
+                summary = _format_csv(rows, (*_COLUMNS, *dict.fromkeys(measured)))
                 _write_table(parent / SUMMARY, summary)  # after every scan: the run may be stopped
                 if options.carry and rows[-1]["status"] < 2:
                     landmarks += _read_landmark_rows(parent / name / CARRIED, title)

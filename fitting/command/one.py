@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import re
 import time
 import traceback
 from pathlib import Path
@@ -12,6 +13,8 @@ import numpy as np
 import jaxsubdiv as js
 from jaxsubdiv.console import make_printable
 
+from ..image.read import is_image
+from ..report.fit_measures import Measure
 from ..report.result import FitResult
 from ..report.saved import read_marks
 from ..run.checkpoint import find_differing
@@ -51,39 +54,40 @@ def _fit_and_save(
     job = read_inputs(scan, options, recipe)
     slices = "" if job.scan.slices is None else f" in {len(np.unique(job.scan.slices))} slices"
     print(f"scan     {job.scan.n_points:,} points{slices}, {describe_size(np.asarray(job.scan.points))}")
-    if job.seen is not None:
+    if job.seen is not None or (job.layered is not None and scan is not None and is_image(scan.path)):
         recipe = suggest_for_image(recipe, job.scan, options)
     marks = mark_job(job, recipe, options)
     done = find_done(folder, marks) if options.resume else None
     if done is not None:
         print(f"done     before, in {folder}")
         print_warnings(done)
-        return make_row(title, done, misfit(done), None)
+        return make_row(title, done, misfit(done), None, options.details)
     if job.mesh is not None:
         counts = f"{len(job.mesh.vertices):,} vertices, {job.mesh.n_faces:,} faces"
         print(f"control  {counts}, {describe_size(job.mesh.vertices)}")
         print_regions(job.scan, job.mesh, job.regions)
+    own = {"landmarks": job.landmarks, "boundary": job.boundary, "regions": job.regions}
+    own |= {} if job.layered is None else job.layered.options(recipe.priors)
     with Progress(recipe.max_sweeps) as progress:
         found = recipe.fit_scan(
             job.scan,
             job.mesh,
-            landmarks=job.landmarks,
-            boundary=job.boundary,
-            regions=job.regions,
+            **own,
             on_stage=progress.stage,
             throw=False,
             on_sweep=progress.update,
             checkpoint=folder,
             keep_checkpoint=True,
         )
+    found = found if job.layered is None else job.layered.judge(found)
     seconds = time.perf_counter() - began
-    report, off = found.result.report(uncertainty=True), misfit(found.result)
+    report, off = found.result.report(uncertainty=True, details=options.details), misfit(found.result)
     print(f"done     in {seconds:.1f} s{describe_ending(found, off)}\n\n{dataclasses.replace(report, warnings=[])}\n")
     save_outputs(folder, found, title, marks, job, options)
     if job.seen is not None and job.mesh is None and (rims := topology_of(found.result.control_mesh).boundary_loops):
         print(f"note     the surface has {rims} rim{'s' * (rims > 1)}: past the end of the image nothing is known")
     print_warnings(found.result)
-    return make_row(title, found.result, off, seconds)
+    return make_row(title, found.result, off, seconds, options.details)
 
 
 def find_done(folder: Path, marks: dict[str, str]) -> FitResult | None:
@@ -104,7 +108,8 @@ def find_done(folder: Path, marks: dict[str, str]) -> FitResult | None:
     return load(folder)
 
 
-def make_row(name: str, result: FitResult, off: float, seconds: float | None) -> dict[str, Any]:
+def make_row(name: str, result: FitResult, off: float, seconds: float | None, details: bool) -> dict[str, Any]:
+    """The row of a fit in the summary: its state, and every measure with its standard deviation."""
     report = result.report()
     return {
         "scan": name,
@@ -117,4 +122,14 @@ def make_row(name: str, result: FitResult, off: float, seconds: float | None) ->
         "misfit_mm": f"{off:.4f}",
         "inlier_share": f"{report.inlier_share:.4f}",
         "warnings": " ".join(finding.name for finding in report.warnings),
-    }
+    } | _columns_of_measures(result.measures(details=details))
+
+
+def _columns_of_measures(measures: tuple[Measure, ...]) -> dict[str, str]:
+    """As `volume_ml` and `volume_sd_ml`."""
+    found = {}
+    for one in measures:
+        words = re.sub(r"[\W_]+", "_", one.name.replace("%", "")).strip("_")
+        unit = re.sub(r"\W+", "_", one.unit.replace("1/", "per "))
+        found |= {f"{words}_{unit}": f"{one.value:.6g}", f"{words}_sd_{unit}": f"{one.deviation:.3g}"}
+    return found

@@ -89,6 +89,12 @@ def make_parser() -> argparse.ArgumentParser:
         help="JSON, label of the scan: group of the template's faces; default: by the names",
     )
     add(
+        "--layers",
+        metavar="FILE",
+        help="fit several surfaces at once, such as lining and outside of a wall: JSON, layer: label of its points, "
+        "from the inside out; of a label map, the labels of all inside it; OUT gets layers/ with each, and thickness",
+    )
+    add(
         "--series",
         action="store_true",
         help="the scans are frames of one anatomy in the order of their names: fitted at once, with --control, one "
@@ -148,6 +154,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("--scheme", choices=tuple(SCHEMES), help="default: interpolating")
     add("--h", type=float, help="tangent length coefficient at the start, for schemes that have one (default: 1)")
     add("--max-sweeps", type=int, help=f"pairing and solving in turns (default: {Recipe.max_sweeps})")
+    add("--details", action="store_true", help="measure curvature, centre, moments of inertia and asymmetry, too")
     add(
         "--recipe", metavar="FILE", help="recipe.json of a fit: its settings; files, --scale and --labels are not in it"
     )

@@ -10,8 +10,9 @@ import jaxsubdiv as js
 from jaxsubdiv.frames import Frame
 
 from ..image.slices import Slice, cut_slices
+from ..report.layers import LayersFit
 from ..report.page import write_page
-from ..report.picture import draw_fit
+from ..report.picture import draw_fit, draw_thickness
 from ..report.result import FitResult
 from ..report.saved import save_fit
 from ..run.carry import carry_landmarks
@@ -22,6 +23,8 @@ from ..scan.landmarks import write_landmarks
 from .exports import find_level, write_exports
 from .inputs import Job
 
+_LAYERS = "layers"
+
 
 def save_outputs(
     folder: Path, found: ScanFit, title: str, marks: dict[str, str], job: Job, options: argparse.Namespace
@@ -29,6 +32,8 @@ def save_outputs(
     """The fit as files, all of them in place of those of an earlier one, or none."""
     result, frame = found.result, job.scan.frame or (job.carried.frame if job.carried is not None else None)
     slices = cut_job_slices(job, result)
+    if result.layers:
+        _write_layers(folder / _LAYERS, LayersFit(result), options, frame)
     with fill_folder(folder) as new:
         js.write_mesh(new / "control.obj", result.control_mesh, frame=frame)
         written = ["control.obj", *_write_surface(new, result, options, frame)]
@@ -38,8 +43,10 @@ def save_outputs(
             for name in (LANDMARKS, CARRIED):
                 write_landmarks(new / name, there.positions, frame=frame, deviations=there.deviations)
                 written.append(name)
-        (new / "report.json").write_text(result.report(uncertainty=True).as_json() + "\n", encoding="utf-8")
-        write_page(new / "fit.html", result, title=title, start=found.start, slices=slices)
+        (new / "report.json").write_text(
+            result.report(uncertainty=True, details=options.details).as_json() + "\n", encoding="utf-8"
+        )
+        write_page(new / "fit.html", result, title=title, start=found.start, details=options.details, slices=slices)
         assert result.recipe is not None
         save_fit(new, result.fit, result.recipe, marks)
         try:
@@ -50,11 +57,37 @@ def save_outputs(
     print(f"wrote    {', '.join(written)} in {folder}")
 
 
+def _write_layers(folder: Path, found: LayersFit, options: argparse.Namespace, frame: Frame | None) -> None:
+    """Every layer's control mesh and surface, and what lies between it and the next, as values and as a picture."""
+    folder.mkdir(exist_ok=True)
+    at = found.result.refine_to()
+    for number, name in enumerate(found.names):
+        thickness = found.thickness(name)
+        of_surface = {
+            "distance_mm": at.distances,
+            "deviation_mm": at.deviations,
+            "thickness_mm": thickness.values,
+            "thickness_deviation_mm": thickness.deviations,
+        }
+        values = {word: found.take_values(name, numbers) for word, numbers in of_surface.items()}
+        js.write_mesh(folder / f"{name}_control.obj", found.control_mesh(name), frame=frame)
+        written = write_surface(folder, found.surface(name), values, options.surface, frame, name)
+        if number + 1 < len(found.names) and (thickness.shares > 0).any():
+            try:
+                draw_thickness(found.result.surface, thickness).savefig(folder / f"{name}_thickness.png")
+                written.append(f"{name}_thickness.png")
+            except ImportError as error:
+                print(f"note     no picture: {error}")
+        print(f"wrote    {name}_control.obj, {', '.join(written)} in {folder}")
+
+
 def _write_surface(folder: Path, result: FitResult, options: argparse.Namespace, frame: Frame | None) -> list[str]:
     """The surface's files; where it has no such level, told, none: the fit itself is not lost."""
     try:
         at = result.refine_to(find_level(result, options))
-        return write_surface(folder, at, options.surface, frame) + write_exports(folder, result, at, options)
+        values = {"distance_mm": at.distances, "deviation_mm": at.deviations}
+        written = write_surface(folder, at.surface, values, options.surface, frame)
+        return written + write_exports(folder, result, at, options)
     except (ValueError, MemoryError) as error:
         print(f"note     no surface: {str(error) or 'it takes more memory than there is'}")
         return []

@@ -1,5 +1,6 @@
 """The scan that an image is: points where the boundary of a label, or a grey value, crosses from voxel to voxel."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -39,8 +40,8 @@ class _Crossings(NamedTuple):
         return (self.middle % 2).argmax(axis=1)
 
 
-def scan_of_label(volume: Volume, label: Label, *, most_points: int = MOST_POINTS) -> Scan:
-    """Points on the boundary of a label.
+def scan_of_label(volume: Volume, label: Label | Sequence[Label], *, most_points: int = MOST_POINTS) -> Scan:
+    """Points on the boundary of a label, or of several together.
 
     Between a voxel inside and its neighbour outside the boundary may be anywhere: the point is the middle, and the
     uniform distribution of the boundary between the two has the standard deviation `spacing / sqrt(12)`. Across the
@@ -50,7 +51,7 @@ def scan_of_label(volume: Volume, label: Label, *, most_points: int = MOST_POINT
 
     Args:
         volume: a label map.
-        label: which, see `choose_label`.
+        label: which, see `choose_label`; of several, the boundary is that of their union.
         most_points: an even part of them, drawn at random, where there are more.
 
     Returns:
@@ -59,17 +60,20 @@ def scan_of_label(volume: Volume, label: Label, *, most_points: int = MOST_POINT
     Raises:
         ScanError: the label has no boundary within the image.
     """
-    mask = mask_of(volume, label)
-    if not mask.any():
-        raise ScanError(f"no voxel has the label '{label}'.")
+    labels = [label] if isinstance(label, Label) else list(label)
+    masks, words = [mask_of(volume, one) for one in labels], " + ".join(map(str, labels))
+    for one, own in zip(labels, masks, strict=True):
+        if not own.any():
+            raise ScanError(f"no voxel has the label '{one}'.")
+    mask = np.any(masks, axis=0)
     low, cut = _cut_out(mask, volume)
     inside = mask[cut]
     found = _find_crossings(inside, 0.5, most_points)
     if not len(found.at):
-        raise ScanError(f"the label '{label}' fills the image: it has no boundary in it.")
+        raise ScanError(f"the label '{words}' fills the image: it has no boundary in it.")
     slope = _slope(inside.astype(np.float32), found.at, _widths(volume))
     outward = _normals(slope, volume)
-    _warn_if_thin(inside, found, outward, volume, str(label))
+    _warn_if_thin(inside, found, outward, volume, words)
     axis = found.axis
     across = np.einsum("px,px->p", outward, _axes(volume)[axis])
     deviations = volume.spacing[axis] * np.sqrt((across**2 + _TURNED**2) / 12)

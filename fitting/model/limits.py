@@ -51,6 +51,7 @@ _LIMITS = {
     "symmetry": _DEVIATION,
     "shift": _DEVIATION,
     "frame_change": _DEVIATION,
+    "thickness": _DEVIATION,
     "likeness": _Limit("the likeness is a share, from 0 to 1", 0, 1),
     "c": _Limit("the width of a loss is in units of the noise, from 1e-6 to 1e6", 1e-6, 1e6),
     "alpha": _Limit("the shape of a loss is 2 or less", -np.inf, 2),

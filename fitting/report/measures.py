@@ -14,7 +14,7 @@ from ..scan.closest_points import closest_points
 from ..start.cavities import Part, find_parts
 
 DENSITY = 1.05  # g/ml, of heart muscle
-_ML, _CM2 = 1e-3, 1e-2  # of cubic and of square mm
+ML, CM2 = 1e-3, 1e-2  # of cubic and of square mm
 
 
 class Column(NamedTuple):
@@ -95,11 +95,11 @@ class Measures:
     def measure(self, surface: js.RefinedSurface, walls: Sequence[Walls]) -> Float[Array, "m"]:
         """The numbers of a surface, in the order of `columns`."""
         x = surface.vertices
-        found = [_ML * jnp.abs(js.losses.enclosed_volume(surface, part=self._parts[i])) for i in self._find_closed()]
+        found = [ML * jnp.abs(js.losses.enclosed_volume(surface, part=self._parts[i])) for i in self._find_closed()]
         if self.is_closed:
-            whole = _ML * js.losses.enclosed_volume(surface, part=self._whole)
+            whole = ML * js.losses.enclosed_volume(surface, part=self._whole)
             found += [whole, DENSITY * whole] if self.cavities else [whole]
-        found += [_CM2 * js.losses.surface_area(surface, part=part) for part in self._parts]
+        found += [CM2 * js.losses.surface_area(surface, part=part) for part in self._parts]
         for wall in walls:
             beyond = js.sum_corners(x, jnp.asarray(wall.corners), jnp.asarray(wall.corner_weights))
             found.append(jnp.sum(jnp.asarray(wall.shares, x.dtype) * norm(x[wall.vertices] - beyond)[:, 0]))

@@ -33,6 +33,7 @@ def write_page(
     title: str = "",
     start: js.ControlMesh | None = None,
     uncertainty: bool = True,
+    details: bool = False,
     slices: Sequence[Slice] = (),
 ) -> None:
     """Write a fit as one HTML file that needs nothing else: it opens from a disk or a mail, without a network.
@@ -47,10 +48,11 @@ def write_page(
         title: above the page; default: "Fit".
         start: the control mesh where the fit started; default: what the result remembers.
         uncertainty: with the standard deviation, which takes a second or more.
+        details: with the details of `FitResult.measures`.
         slices: of the image that the scan was seen in, see `cut_slices`: shown with the surface's contour, where
             matplotlib of the extra `viz` is installed.
     """
-    report = result.report(uncertainty=uncertainty)
+    report = result.report(uncertainty=uncertainty, details=details)
     first = result.start if start is None else start
     here, title = Path(__file__).parent, html.escape(make_printable(title) or "Fit")
     parts = {

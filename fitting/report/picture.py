@@ -13,7 +13,9 @@ from jaxsubdiv.console import make_printable
 from jaxsubdiv.extras import import_extra
 
 from ..image.slices import Slice
+from ..scan.layers import take_part
 from .result import FitResult
+from .thickness import Thickness
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -56,6 +58,47 @@ def draw_fit(result: FitResult, start: js.ControlMesh, *, title: str = "", slice
     for row in below:
         for ax, one in zip(row, slices, strict=True):
             _draw_slice(ax, one, surface)
+    return figure
+
+
+def draw_thickness(surface: js.RefinedSurface, thickness: Thickness, *, title: str = "") -> "Figure":
+    """A figure of a thickness on its layer: from two sides, with its standard deviation and its distribution.
+
+    Args:
+        surface: of all layers.
+        thickness: of that surface.
+        title: above the picture; default: the names of the layers.
+
+    Returns:
+        A matplotlib figure: `.savefig("thickness.png")`.
+
+    Raises:
+        ImportError: matplotlib is missing; it comes with the extra `viz`.
+    """
+    figure = make_figure(15.0, 9.5)
+    figure.suptitle(make_printable(title) or f"{thickness.layer} to {thickness.other}", fontsize=14, parse_math=False)
+    known = thickness.shares > 0
+    corners = [known[np.asarray(surface.faces[size])].any(axis=1) for size in (3, 4)]
+    layer = take_part(surface, np.concatenate(corners))
+    view, values = js.view_of(layer), thickness.values
+    back = view * np.array([[-1.0], [1.0], [-1.0]])
+    low, high = np.percentile(values[known], [1, 99])
+    most = float(np.percentile(thickness.deviations[known], 99))
+    (front, behind), (spread, counts) = figure.subplots(2, 2)
+    for ax, rows, of, limits, name in (
+        (front, view, values, (low, max(high, low + 1e-6)), "thickness"),
+        (behind, back, values, (low, max(high, low + 1e-6)), "the same from behind"),
+        (spread, view, thickness.deviations, (0, max(most, 1e-6)), "standard deviation"),
+    ):
+        colours = js.draw_surface(ax, layer, view=rows, values=of, limits=limits, cmap="viridis")
+        ax.set_title(name)
+        bar = figure.colorbar(colours, cax=ax.inset_axes((0.1, -0.08, 0.8, 0.03)), orientation="horizontal")
+        bar.set_label("mm")
+    counts.hist(np.clip(values[known], low, high), bins=60, weights=100 * thickness.shares[known], color="tab:blue")
+    counts.set_xlabel("thickness, mm (the ends hold what is beyond)")
+    counts.set_ylabel("% of the area")
+    counts.set_title(f"mean {thickness.mean:.3g} mm")
+    counts.grid(True, alpha=0.3)
     return figure
 
 

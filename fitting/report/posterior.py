@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Float, Int
 
 import jaxsubdiv as js
@@ -23,6 +24,7 @@ from ..solve.derivatives import differentiate_across
 from ..solve.elements import face_corners, slopes_of_rows, times_transposed
 from ..solve.sparse_normal import SparseEquations
 from ..solve.strengths import neighbourhood_mean
+from ..solve.structure import sparse_rows
 from .misfit import misfit_variances
 from .record import Fit
 
@@ -167,6 +169,43 @@ class Posterior:
         patches = [owner[face]] + [face // 4**level for level in finer]
         average, n_faces = neighbourhood_mean(topology), topology.n_control_faces
         return misfit_variances(distances, weights, at_points, patches, average, n_faces)
+
+    def displace(self, offsets: Float[np.ndarray, "u k"]) -> Float[np.ndarray, "v 3 k"]:
+        """How far offsets of the unknowns move every vertex of the surface, to first order, in mm."""
+        structure, of_surface = self.equations.structure, np.asarray(self.equations.found.of_surface)
+        n, face = len(of_surface), structure.faces_of_vertices(len(of_surface))
+        moved = np.zeros((n, 3, offsets.shape[1]))
+        for rows in np.array_split(np.arange(n), -(-n // _ROWS_AT_ONCE)):
+            along = of_surface[rows].reshape(3 * len(rows), -1)
+            moved[rows] = (self._slopes(along, np.repeat(face[rows], 3)) @ offsets).reshape(len(rows), 3, -1)
+        return moved
+
+    def find_slopes(
+        self,
+        corners: Int[np.ndarray, "p c"],
+        weights: Float[np.ndarray, "p c"],
+        directions: Float[np.ndarray, "p 3"],
+        face: Int[np.ndarray, "p"],
+    ) -> sp.csr_array:
+        """Derivatives by all unknowns of how far places of the surface lie along directions, `[p, u]`.
+
+        Args:
+            corners, weights: vertices of the surface around each place, and how much of it each is.
+            directions: unit vectors.
+            face: a control face that all corners of a place lie in.
+        """
+        of_surface, found = np.asarray(self.equations.found.of_surface), []
+        for rows in np.array_split(np.arange(len(face)), -(-len(face) // _ROWS_AT_ONCE) or 1):
+            factors = (weights[rows][:, :, None] * directions[rows][:, None]).astype(of_surface.dtype)
+            along = np.einsum("pcx,pcxs->ps", factors, of_surface[corners[rows]])
+            found.append(self._slopes(along, face[rows]))
+        return sp.csr_array(sp.vstack(found))
+
+    def _slopes(self, along: Float[np.ndarray, "p s"], face: Int[np.ndarray, "p"]) -> sp.csr_array:
+        """Derivatives by all unknowns, from those along the seeds."""
+        elements, n = self.equations.structure.elements, self.fit.model.layout.n
+        columns = np.where(elements.columns < elements.n, elements.columns, n)[face]
+        return sparse_rows(slopes_of_rows(elements, along, face), columns, n)
 
     def draws(self, n: int, seed: int = 0) -> Float[np.ndarray, "u n"]:
         """Random offsets of the unknowns, as probable as the posterior has them; see `Layout` for their order."""

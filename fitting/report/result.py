@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import final
 
 import numpy as np
@@ -22,12 +22,21 @@ from .at_level import SurfaceAtLevel
 from .coverage import distances_to_scan, weighted_quantile, worst_places
 from .evidence import gather_evidence
 from .findings import find_what_speaks_against
-from .fit_measures import Measure, measure_surface
+from .fit_measures import (
+    CrossSection,
+    Measure,
+    Numbers,
+    measure_cross_section,
+    measure_details,
+    measure_landmarks,
+    measure_surface,
+)
 from .posterior import Posterior, Uncertainty
 from .record import Fit, choose_faces, look_at
 from .refit import Refit, make_refit
 from .report import RegionDistance, Report, SliceShift, WorstPlace
 from .saved import save_fit
+from .thickness import Thickness, measure_thickness
 
 
 @final
@@ -133,8 +142,11 @@ class FitResult:
         except ImportError:
             return None
 
-    def measures(self, valves: Sequence[str] | None = None) -> tuple[Measure, ...]:
+    def measures(self, valves: Sequence[str] | None = None, *, details: bool = False) -> tuple[Measure, ...]:
         """Volume, area, and of a wall its cavities, mass and thickness, each with its standard deviation.
+
+        Of layers each has a volume and an area, and between one and the next there are the difference of their volumes
+        and the mean thickness.
 
         Where the control mesh has groups that are valves, the parts between them are measured one by one: the volume of
         each cavity, closed by a flat cap over every opening, and the thickness of the wall around it. The volume of an
@@ -142,16 +154,85 @@ class FitResult:
 
         Args:
             valves: the groups that close the openings of cavities; default: those whose names say so.
+            details: with the 5th, 50th and 95th percentile of mean and Gaussian curvature over the area, positive on a
+                ball; of a closed surface with the centre and the principal moments of inertia of its inside, at 1 g/ml;
+                and where the fit has a mirror plane, with the distance of the control vertices from their mirror
+                images. Curvatures are differences over the refined surface: those of the interpolating scheme have no
+                bound at control vertices, and finer levels show larger ones there.
 
         Raises:
             ValueError: a group is none of the control mesh.
         """
-        return self._measures if valves is None else measure_surface(self.posterior, self.control_mesh, valves)
+        found = self._measures if valves is None else measure_surface(self.posterior, self.control_mesh, valves)
+        return (*found, *self._details) if details else found
+
+    @functools.cached_property
+    def _details(self) -> tuple[Measure, ...]:
+        return measure_details(self.posterior)
+
+    def cross_section(self, origin: Numbers, normal: Numbers) -> CrossSection:
+        """Area and perimeter of the surface where a plane passes it, with standard deviations, and the contours.
+
+        Args:
+            origin: a point of the plane, in mm.
+            normal: the direction that the plane is across, of any length.
+
+        Raises:
+            ValueError: the plane does not pass the surface.
+        """
+        return measure_cross_section(self.posterior, origin, normal)
+
+    def measure_landmarks(
+        self, landmarks: Mapping[str, Numbers], angles: Sequence[tuple[str, str, str]] = ()
+    ) -> tuple[Measure, ...]:
+        """Distances between landmarks on the surface, all pairs, and angles, with standard deviations.
+
+        How the surface may slide along itself is in these only as far as the priors and landmarks of the fit say.
+
+        Args:
+            landmarks: positions by name, as `carry_landmarks(...).positions`; each moves with the place of the surface
+                that is closest to it.
+            angles: three names each: that at the second, between the ways to the other two.
+
+        Raises:
+            ValueError: fewer than two landmarks, or a name that is none of them.
+        """
+        return measure_landmarks(self.posterior, landmarks, angles)
 
     @functools.cached_property
     def _measures(self) -> tuple[Measure, ...]:
         """With the valves that the groups' names say: asked for by every report."""
         return measure_surface(self.posterior, self.control_mesh)
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the regions that were fitted as layers, from the inside out; none of other fits."""
+        return self.fit.inputs.get("layers") or ()
+
+    def find_faces(self, region: str) -> Bool[np.ndarray, "f"]:
+        """Which faces of the refined surface lie in a region of the control mesh, triangles first.
+
+        Raises:
+            ValueError: there is no such region.
+        """
+        of_control = None if self.fit.regions is None else self.fit.regions.faces
+        if of_control is None or region not in of_control.names:
+            there = "none" if of_control is None else ", ".join(of_control.names)
+            raise ValueError(f"'{region}' is no region of the control mesh; it has {there}.")
+        owner = js.control_faces_of(self.scheme, self.fit.topology, self.surface, self.control)
+        return of_control.rows[owner] == of_control.names.index(region)
+
+    def thickness(self, region: str, other: str) -> Thickness:
+        """How thick what lies between two regions is, at every vertex of one of them, with standard deviations.
+
+        Args:
+            region: where it is measured.
+            other: the region on the other side, such as the next layer, or the outside of a wall.
+
+        Raises:
+            ValueError: there is no such region.
+        """
+        return measure_thickness(self.posterior, (region, other), self.find_faces(region), self.find_faces(other))
 
     @functools.cached_property
     def control_mesh(self) -> js.ControlMesh:
@@ -214,12 +295,13 @@ class FitResult:
     def inliers(self) -> Bool[np.ndarray, "p"]:
         return self.fit.inliers
 
-    def report(self, *, uncertainty: bool = False) -> Report:
+    def report(self, *, uncertainty: bool = False, details: bool = False) -> Report:
         """The fit in numbers: `print` it, or take `.as_dict()`.
 
         Args:
             uncertainty: with that of the surface, with `measures`, and with the triangles that cross others, which
                 takes a second or more.
+            details: with the details of `measures`, too.
         """
         areas, to_scan = self._seen_from_the_scan
         covered = ~np.isnan(to_scan)
@@ -262,7 +344,7 @@ class FitResult:
             least_margin=float(js.admissible_margin(self.control_mesh).min()) if self.scheme.uses_normals else None,
             crossing_triangles=None if crossings is None else len(crossings.triangles),
             crossings_at=np.median(crossings.places, axis=0).tolist() if crossings and len(crossings.places) else None,
-            measures=list(self.measures()) if uncertainty else [],
+            measures=list(self.measures(details=details)) if uncertainty else [],
             uncertainty_median=None if spread is None else weighted_quantile(spread, share, 0.5),
             uncertainty_95=None if spread is None else weighted_quantile(spread, share, 0.95),
             shifts=[SliceShift(int(i), shift.tolist()) for i, shift in zip(self.slices, self.shifts, strict=True)],

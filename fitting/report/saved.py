@@ -98,6 +98,7 @@ def save_fit(
     arrays |= _arrays_of_regions(fit.scan.regions, fit.regions)
     inputs = fit.inputs
     arrays["alike"] = inputs.get("alike")
+    arrays["layers"] = json.dumps(inputs["layers"]) if inputs.get("layers") else None
     arrays["marks"] = None if marks is None else json.dumps(marks)
     if inputs.get("landmarks") is not None:
         arrays |= {f"anchor_{name}": value for name, value in inputs["landmarks"]._asdict().items()}
@@ -254,6 +255,7 @@ def _restore(arrays: dict[str, np.ndarray]) -> Fit:
     of_points: dict[str, Any] = {name: arrays.get(f"scan_{name}") for name in _OF_SCAN}
     scan = Scan(**of_points, frame=_frame_of(arrays), regions=_regions_of(arrays, "scan"))
     inputs: dict[str, Any] = {"alike": arrays.get("alike"), "regions": _match_of(arrays, mesh.n_faces)}
+    inputs["layers"] = tuple(json.loads(str(arrays["layers"]))) if "layers" in arrays else ()
     if "anchor_points" in arrays:
         inputs["landmarks"] = Anchors(*(put_on_device(f"anchor_{name}") for name in Anchors._fields))
     if "symmetry_partner" in arrays:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
@@ -81,6 +81,7 @@ def fit(
     boundary: BoundaryCurve | None = None,
     alike: Bool[np.ndarray, "f"] | None = None,
     regions: RegionMatch | None = None,
+    layers: Sequence[str] | None = None,
     linear_solver: LinearSolver | None = None,
     max_sweeps: int = 60,
     tolerance: float = 0.1,
@@ -119,6 +120,8 @@ def fit(
             first. Default: all.
         regions: which control faces the points of each label of the scan lie on, by `match_regions`: they are paired
             with the closest place of these. Points of other labels, or of none, are paired with any.
+        layers: regions that lie one around the other, from the inside out: what lies between two that follow each other
+            changes its thickness little from place to place, see `Priors.thickness`. `fit_layers` makes them.
         linear_solver: "sparse" solves the normal equations of each sweep on the host, "conjugate gradients" pairs and
             solves where JAX computes; default: "sparse" on the CPU, else the other. Both come to the same surface.
         max_sweeps: how many sweeps at most.
@@ -149,14 +152,16 @@ def fit(
         n_faces = topology.n_control_faces
         raise ValueError(f"`alike` must say it of each of the {n_faces} control faces; got {list(alike.shape)}.")
     check_regions(regions, topology)
+    layers = check_layers(layers, regions)
     control = sound_start(scheme, topology, control, free)
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
     settings["landmark_deviation"] = landmark_deviation
     given = {"scheme": scheme, "topology": topology, "control": control, "scan": scan, "landmarks": landmarks}
     given |= {"symmetry": symmetry, "boundary": boundary, "alike": alike, "solver": linear_solver, "regions": regions}
+    given |= {"layers": layers} if layers else {}
     kept = None if checkpoint is None else Checkpoint(Path(checkpoint) / CHECKPOINT, given | settings)
     inputs = gather_inputs(scheme, topology, control, scan, free, landmarks, landmark_deviation, boundary)
-    inputs |= {"symmetry": symmetry, "alike": alike, "regions": regions}
+    inputs |= {"symmetry": symmetry, "alike": alike, "regions": regions, "layers": layers}
     model, y = analyse(scheme, topology, control, free, priors, inputs)
     scene = make_scene(scan, model.refine(y), inputs["slices"], choose_faces(regions, model, y, scan))
     solver = make_solver(model, y, scene, linear_solver, loss, tolerance, max_sweeps)
@@ -312,6 +317,21 @@ def check_regions(regions: RegionMatch | None, topology: js.Topology) -> None:
             f"`regions` are of {len(regions.faces)} control faces, and the topology has {topology.n_control_faces}. "
             "Match the scan with the control mesh that the topology was made from."
         )
+
+
+def check_layers(layers: Sequence[str] | None, regions: RegionMatch | None) -> tuple[str, ...]:
+    """The names of layers, each a region."""
+    names = tuple(layers or ())
+    there = () if regions is None else regions.faces.names
+    lost = [name for name in names if name not in there]
+    if lost:
+        raise ValueError(
+            f"the layer '{lost[0]}' is no region of the control mesh; it has {', '.join(there) or 'none'}. Give "
+            "`regions`, by `match_regions`, or fit by `fit_layers`."
+        )
+    if len(names) == 1 or len(set(names)) < len(names):
+        raise ValueError(f"`layers` are two regions or more, each once, from the inside out; got {', '.join(names)}.")
+    return names
 
 
 def find_partners(

@@ -1,12 +1,13 @@
 """The files that a fitted surface is written to, by the names that the command line has for their formats."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
 
 import jaxsubdiv as js
 from jaxsubdiv.frames import Frame
-
-from ..report.at_level import SurfaceAtLevel
 
 _FILES = {
     "ply": "surface.ply",
@@ -33,18 +34,29 @@ def check_formats(formats: Iterable[str]) -> None:
         js.check_can_write(_FILES[name], vertex_data=name in _WITH_DATA)
 
 
-def write_surface(folder: Path, at: SurfaceAtLevel, formats: Sequence[str], frame: Frame | None = None) -> list[str]:
-    """Write a surface, and the distances and deviations at its vertices where the format holds them.
+def write_surface(
+    folder: Path,
+    surface: js.RefinedSurface,
+    values: Mapping[str, Float[np.ndarray, "v"]],
+    formats: Sequence[str],
+    frame: Frame | None = None,
+    name: str = "surface",
+) -> list[str]:
+    """Write a surface, and the values at its vertices where the format holds them.
+
+    Args:
+        values: by their names.
+        name: of the files, before their endings.
 
     Returns:
         the names of the files.
     """
-    values, written = {"distance_mm": at.distances, "deviation_mm": at.deviations}, []
-    for name in dict.fromkeys(formats):
-        of_vertices = values if name in _WITH_DATA else None
-        js.write_mesh(folder / _FILES[name], at.surface, vertex_data=of_vertices, frame=frame)
-        written.append(_FILES[name])
-        if name == "gii":
-            js.write_mesh(folder / _DATA_OF_GIFTI, at.surface, vertex_data=values)
-            written.append(_DATA_OF_GIFTI)
+    written = []
+    for kind in dict.fromkeys(formats):
+        of_vertices = values if kind in _WITH_DATA else None
+        written.append(_FILES[kind].replace("surface", name, 1))
+        js.write_mesh(folder / written[-1], surface, vertex_data=of_vertices, frame=frame)
+        if kind == "gii":
+            written.append(_DATA_OF_GIFTI.replace("surface", name, 1))
+            js.write_mesh(folder / written[-1], surface, vertex_data=values)
     return written

@@ -72,13 +72,15 @@ def place_frames(scans: Sequence[Scan], periodic: bool) -> tuple[Scan, Frames]:
     frames = Frames(
         np.ceil(_APART * size) * places.astype(float), np.array([scan.n_points for scan in scans]), periodic
     )
+    names = [f"frame {k}" for k in range(n)]
     parts: dict[str, Any] = {
-        name: _join(name, [getattr(scan, name) for scan in scans]) for name in ("normals", "deviations", "slices")
+        name: join_rows(name, [getattr(scan, name) for scan in scans], names)
+        for name in ("normals", "deviations", "slices")
     }
     weights = None
     if any(scan.weights is not None for scan in scans):
         weights = np.concatenate([np.asarray(scan.weights_or_ones()) for scan in scans])
-    _join("regions", [None if scan.regions is None else scan.regions.rows for scan in scans])
+    join_rows("regions", [None if scan.regions is None else scan.regions.rows for scan in scans], names)
     words = [word for scan in scans if scan.regions is not None for word in scan.regions.words()]
     placed = [rows + offset.astype(rows.dtype) for rows, offset in zip(points, frames.offsets, strict=True)]
     whole = Scan(np.concatenate(placed), weights=weights, regions=words or None, frame=scans[0].frame, **parts)
@@ -138,12 +140,16 @@ def check_slices(scans: Sequence[Scan], names: Sequence[str]) -> None:
                 )
 
 
-def _join(name: str, parts: list) -> np.ndarray | None:
+def join_rows(what: str, parts: Sequence[Any], names: Sequence[str]) -> np.ndarray | None:
+    """Rows that several scans have of their points, one after another; None where none has any.
+
+    Raises:
+        ScanError: some have and others have not; the text names one of these.
+    """
     given = [part is not None for part in parts]
     if not any(given):
         return None
     if not all(given):
-        raise ScanError(
-            f"frame {given.index(False)} has no `{name}` and others have: give them for all frames, or for none."
-        )
+        lacking = names[given.index(False)]
+        raise ScanError(f"{lacking} has no `{what}` and others have: give them for all, or for none.")
     return np.concatenate([np.asarray(part) for part in parts])

@@ -19,6 +19,7 @@ from .shifts import ShiftPrior
 from .stretch import Stretch
 from .symmetry import SymmetryPrior
 from .tangent_length import TangentLength
+from .thickness import ThicknessPrior
 from .valves import ValvePrior
 
 REGISTER: tuple[type[AbstractPrior], ...] = (
@@ -34,6 +35,7 @@ REGISTER: tuple[type[AbstractPrior], ...] = (
     SymmetryPrior,
     ShapePrior,
     SeriesPrior,
+    ThicknessPrior,
 )
 """Every prior, in the order of its rows; a new one is one line here, and a field of `Priors` for its settings."""
 
@@ -72,6 +74,8 @@ class Priors(eqx.Module):
         shift: of how far breathing displaced a slice of the scan, in mm, along each of two axes of the slice's plane.
         frame_change: of how far a control vertex moves from one frame of a series to the next, in mm, in each
             coordinate; see `fit_series`. None, the default: found from the scans.
+        thickness: of how much thicker what lies between two layers is at a control vertex than at the next, in mm; see
+            `fit_layers`. None, the default: found from the scan, place by place.
 
     Raises:
         ValueError: a standard deviation is not positive, or the likeness not from 0 to 1.
@@ -85,9 +89,9 @@ class Priors(eqx.Module):
     likeness: Float[Array, ""] | None = eqx.field(converter=_if_given, default=None)
     frame_change: Float[Array, ""] | None = eqx.field(converter=_if_given, default=None)
     shape: ShapeModes | None = eqx.field(converter=ShapeModes.of, default=None)
+    thickness: Float[Array, ""] | None = eqx.field(converter=_if_given, default=None)
 
     def __check_init__(self) -> None:
-        check_numbers(
-            {name: getattr(self, name) for name in ("bend", "stretch", "symmetry", "shift", "frame_change", "likeness")}
-        )
+        names = ("bend", "stretch", "symmetry", "shift", "frame_change", "likeness", "thickness")
+        check_numbers({name: getattr(self, name) for name in names})
         check_numbers({"h of priors": self.h})
