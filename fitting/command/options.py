@@ -131,7 +131,7 @@ def make_parser() -> argparse.ArgumentParser:
     add(
         "--resume",
         action="store_true",
-        help="skip the scans that OUT has whole fits of, from the same inputs and options",
+        help="skip the scans, or the series, that OUT has whole fits of, from the same inputs and options",
     )
     add("--example", choices=get_args(Example), default="head_fragment", help="which, without SCAN")
     return parser
