@@ -1,6 +1,6 @@
 """Subjects fitted in buckets: those of a size class share one compiled program, and several devices share a bucket."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,14 @@ from ..model.pairing import Scene
 from ..model.residual import Model
 from ..model.unknowns import Variables
 from ..report.cohort import CHECKPOINT_OF_COHORT
-from ..solve.strengths import Strengths
+from ..solve.strengths import FromTargets
 from ..solve.sweeps import State, Subject, Sweeps, subject_residual
 from .checkpoint import Checkpoint, marks_of
 from .stack import fill_scene, split_common, stack
 
 _SMALLEST, _GROWTH = 1024, 1.25  # points: below the smallest, compiling again costs more than the points filled up
+_FEW, _MOST_GROWN = 8, 2.0  # so few scans join a larger class of at most so many times their points: that costs less
+_OF_PILOT = ("likeness", "determined")  # beside the strengths
 
 
 class Kept:
@@ -66,17 +68,16 @@ class Kept:
         if self._writes:
             self._file(name).write_tree(tree)
 
-    def strengths(self, find: Callable[[], Strengths]) -> Strengths:
+    def strengths(self, find: Callable[[], FromTargets]) -> FromTargets:
         """Those that a pilot finds, or found before."""
         arrays = self._file("pilot").read() if self._writes else None
         if arrays is not None:
-            determined, annealed = arrays.pop("determined"), arrays.pop("annealed")
-            found = Strengths(arrays, determined, annealed)
+            rest = {name: arrays.pop(name) for name in _OF_PILOT}
+            found = FromTargets(arrays, **rest)
         else:
             found = jax.tree.map(np.asarray, find())
             if self._writes:
-                rest = {"determined": found.determined, "annealed": found.annealed}
-                self._file("pilot").write(found.values | rest)
+                self._file("pilot").write(found.values | {name: getattr(found, name) for name in _OF_PILOT})
         return share_first(found) if self._several else found
 
     def _file(self, name: str) -> Checkpoint:
@@ -95,6 +96,23 @@ def size_class(n_points: int) -> int:
     while size < n_points:
         size = int(size * _GROWTH)
     return size
+
+
+def sort_into_classes(n_points: Sequence[int]) -> list[tuple[int, list[int]]]:
+    """Size classes in ascending order, each with the rows of its scans.
+
+    Args:
+        n_points: of each scan.
+    """
+    classes: dict[int, list[int]] = {}
+    for i, n in enumerate(n_points):
+        classes.setdefault(size_class(n), []).append(i)
+    found: list[tuple[int, list[int]]] = []
+    for size, members in sorted(classes.items()):
+        if found and len(found[-1][1]) < _FEW and size <= _MOST_GROWN * found[-1][0]:
+            members = found.pop()[1] + members
+        found.append((size, members))
+    return found
 
 
 def fit_in_buckets(
@@ -126,14 +144,8 @@ def fit_in_buckets(
     has_slices = any(scene.of_points is not None for scene in scenes)
     shared, own = split_common(starts)
     common = _place((solver, shared), mesh, P())
-    classes: dict[int, list[int]] = {}
-    for i, scene in enumerate(scenes):
-        classes.setdefault(size_class(scene.scan.n_points), []).append(i)
-    buckets = [
-        (size, members[k : k + n_bucket])
-        for size, members in sorted(classes.items())
-        for k in range(0, len(members), n_bucket)
-    ]
+    classes = sort_into_classes([scene.scan.n_points for scene in scenes])
+    buckets = [(size, members[k : k + n_bucket]) for size, members in classes for k in range(0, len(members), n_bucket)]
 
     def arguments(size: int, members: list[int]) -> tuple[Any, ...]:
         filled = members + members[-1:] * (n_bucket - len(members))
@@ -156,7 +168,7 @@ def fit_in_buckets(
             given = arguments(size, members)
             if size not in told:
                 told.add(size)
-                on_stage(_describe(size, len(classes[size]), n_bucket, given))
+                on_stage(_describe(size, len(dict(classes)[size]), n_bucket, given))
             ends = _fetch(_run(*given), mesh)
             kept.write(f"{number:05d}", ends)
         for k, i in enumerate(members):

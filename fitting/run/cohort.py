@@ -39,16 +39,17 @@ from ..scan.landmarks import Landmarks
 from ..scan.regions import RegionMatch
 from ..scan.scan import Scan, ScanError
 from ..solve.conjugate_gradients import ConjugateGradients
-from ..solve.strengths import FromTargets, Strengths
+from ..solve.strengths import FromTargets
 from ..solve.sweeps import CONVERGED, NONFINITE, State, Sweeps, loose_damping
 from ..start.folds import Folds
 from .buckets import Kept, fit_in_buckets
 from .fit import check, check_regions, find_partners, gather_inputs, record_fit, sound_start
-from .pilot import Member, make_pilot
+from .pilot import Member, make_pilot, take_strengths
 from .stack import fill_choices, fill_up, share_equal
 
-# Of the gradient, squared sums: tighter solves of a sweep, whose pairs change anyway, take longer in all.
-_SOLVED, _MOST_STEPS = 0.03, 200
+# Of the gradient. Stiff priors make up most of it: where less of it is solved, the surface hardly follows the scan from
+# sweep to sweep, which looks like rest (at 0.03 a heart stopped 5 mm from its contours, `tests/bench/fit_cohorts.py`).
+_SOLVED, _MOST_STEPS = 0.001, 1000
 _T = TypeVar("_T")
 
 
@@ -78,9 +79,9 @@ def fit_cohort(
 ) -> Cohort:
     """Fit one control mesh to many scans, by one compiled program for all scans of about a size.
 
-    Scans are sorted into classes by their number of points: up to 1024, and then a quarter more from class to class.
-    Each class is compiled once, which takes as long as several fits. After that each fit takes a fraction of the time
-    of `fit`, and is as near to the truth.
+    Scans are sorted into classes by their number of points: up to 1024, and then a quarter more from class to class; a
+    few scans join the next larger class. Each class is compiled once, which takes as long as several fits. After that
+    each fit takes a fraction of the time of `fit`, and is as near to the truth.
 
     Args:
         scheme, topology: as in `fit`.
@@ -152,9 +153,8 @@ def fit_cohort(
     strengths = None
     if pilot is not None or any(one.n_strengths and one.given_strengths() is None for one in made[0][0].priors):
         say("finds the strengths of the priors by a fit of one scan")
-        strengths = kept.strengths(
-            lambda: make_pilot(scheme, topology, given, {"symmetry": partners} | settings, pilot).fit.strengths
-        )
+        of_pilot = {"symmetry": partners} | settings
+        strengths = kept.strengths(lambda: take_strengths(make_pilot(scheme, topology, given, of_pilot, pilot)))
     without = () if strengths is None or priors.bend is not None or "height" in strengths.values else ("height",)
     filled = fill_up(inputs)
     filled = made if filled is inputs else _analyse_all(scheme, topology, given, free, priors, filled)
@@ -217,21 +217,19 @@ def fit_cohort(
     )
 
 
-def find_targets(model: Model, priors: Priors, pilot: Strengths | None) -> FromTargets:
+def find_targets(model: Model, priors: Priors, pilot: FromTargets | None) -> FromTargets:
     """Strengths of the priors, and what is expected of bends: as given, or as the pilot found them."""
-    told = {} if pilot is None else pilot.values
+    pilot = pilot or FromTargets({}, 0.0, 0.0)
     values = {}
     for prior in model.priors:
         if prior.n_strengths:
             given = prior.given_strengths()
-            values[prior.name] = told.get(prior.name, prior.first_strengths()) if given is None else given
+            values[prior.name] = pilot.values.get(prior.name, prior.first_strengths()) if given is None else given
     likeness = priors.likeness
     if likeness is None:
-        likeness = told.get("likeness", 0.0) if priors.bend is None else 0.0
-    determined = 0.0 if pilot is None else pilot.determined
-    dtype = model.template.dtype
-    values, likeness, determined = jax.tree.map(lambda x: jnp.asarray(x, dtype), (values, likeness, determined))
-    return FromTargets(values, likeness, determined)
+        likeness = pilot.likeness if priors.bend is None else 0.0
+    targets = FromTargets(values, likeness, pilot.determined)
+    return jax.tree.map(lambda x: jnp.asarray(x, model.template.dtype), targets)
 
 
 def _give_each(controls: Any, scans: Sequence[Scan], landmarks: Any, boundary: Any, regions: Any) -> list[Member]:

@@ -15,6 +15,7 @@ from ..scan.closest_points import closest_points
 from ..scan.landmarks import Landmarks
 from ..scan.regions import RegionMatch
 from ..scan.scan import Scan
+from ..solve.strengths import FromTargets
 from .fit import fit
 
 # A start that is the fit of the pilot's own scan is expected to return bit by bit, noise included: the scan is found
@@ -73,6 +74,13 @@ def make_pilot(
         f"differ: {how}. Start from a template or a mean, or give a pilot of another scan.",
     )
     return other
+
+
+def take_strengths(pilot: FitResult) -> FromTargets:
+    """What a pilot tells of the fits of other scans of the kind."""
+    values = dict(pilot.fit.strengths.values)
+    likeness = values.pop("likeness")
+    return FromTargets(values, likeness, pilot.fit.strengths.determined)
 
 
 def is_its_own_start(pilot: FitResult) -> bool:

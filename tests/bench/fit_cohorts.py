@@ -7,6 +7,8 @@ points of the half that was left out to the surface. Mirrored: the half that is 
 the template where it was aligned, or where the family's member lies, or, as a bound, about that of the whole skull.
 `killed` fits 200 subjects made from a scan that ships, in a process that is killed three times at random moments and
 started again, and in one that is not, and compares the fits bit for bit.
+`scale` fits cohorts of other numbers of points and subjects at once, each in a process of its own: CPU seconds a
+subject once compiled, of all its preparation too; memory of the device as told before; and the most of the process.
 Only points of a skull that are seen from outside count. Lengths in mm. Prints Markdown tables.
 
     pip install -e '.[bench]' && python tests/bench/fit_cohorts.py half --subjects 3 8 14
@@ -16,6 +18,7 @@ The data are not shipped: they are taken from ../shared/data beside the reposito
 
 import argparse
 import json
+import resource
 import subprocess
 import sys
 import time
@@ -247,9 +250,46 @@ def killed(folder: Path, n: int, kills: int) -> None:
     print(f"control vertices: {'identical' if same else 'DIFFERENT'}")
 
 
+def scale() -> None:
+    cases = [(1000, 1), (1000, 8), (4000, 1), (16000, 1)]
+    print("| points | at once | CPU s a subject | CPU s to compile | MB on the device | GB in all |", flush=True)
+    print("|--:|--:|--:|--:|--:|--:|", flush=True)
+    for case in cases:
+        command = [sys.executable, __file__, "scale_case", "--subjects", *map(str, case)]
+        out = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout
+        print(out.splitlines()[-1], flush=True)
+
+
+def scale_case(n_points: int, at_once: int) -> None:
+    scan, mesh = fitting.example("head_fragment")
+    rng, points, n, scheme = np.random.default_rng(0), np.asarray(scan.points, np.float64), 8, js.Interpolating()
+    topology = js.build_topology(js.ControlMesh(mesh.vertices, mesh.faces), scheme, 1)
+    scans = []
+    for _ in range(n):
+        some = points[rng.integers(0, len(points), n_points)] * (1 + rng.normal(scale=0.03, size=3))
+        scans.append(fitting.Scan(some + rng.normal(scale=0.2, size=some.shape)))
+    told, seconds = [], []
+    for _ in range(2):
+        began = time.process_time()
+        fitting.fit_cohort(
+            scheme,
+            topology,
+            mesh.control(),
+            scans,
+            priors=fitting.Priors(bend=0.01, likeness=0.5),
+            at_once=at_once,
+            on_stage=told.append,
+        )
+        seconds.append(time.process_time() - began)
+    memory = next(words for words in told if " MB" in words).split(" in ")[-1].split(" MB")[0]
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9  # KiB on Linux
+    own = seconds[1] / n
+    print(f"| {n_points:,} | {at_once} | {own:.2f} | {seconds[0] - seconds[1]:.0f} | {memory} | {most:.2f} |")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("what", choices=("heart", "first", "half", "killed", "fit_subjects"))
+    parser.add_argument("what", choices=("heart", "first", "half", "killed", "fit_subjects", "scale", "scale_case"))
     parser.add_argument("--data", type=Path, default=DATA, help=f"folder of the scans (default: {DATA})")
     parser.add_argument("--subjects", type=int, nargs="+", default=[3, 8, 14], help="whose half is fitted")
     parser.add_argument("--n", type=int, help="skulls of a mean, or subjects of `killed` (default: 6, 200)")
@@ -257,6 +297,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.what == "killed":
         killed(options.family, options.n or 200, 3)
+        return 0
+    if options.what == "scale":
+        scale()
+        return 0
+    if options.what == "scale_case":
+        scale_case(*options.subjects)
         return 0
     if options.what == "fit_subjects":
         fit_subjects(options.family, options.n)
