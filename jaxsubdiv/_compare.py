@@ -19,7 +19,7 @@ from ._scheme import SCHEMES
 from ._stencils import interpolating_control
 from ._surface import RefinedSurface, sample
 from ._topology import MAX_LEVELS, build_topology
-from .files import replacing
+from .files import replace_file
 
 N_SAMPLES = 20_000
 
@@ -50,7 +50,7 @@ def compare(mesh: ControlMesh, truth: ControlMesh, levels: int) -> tuple[list[Ro
     Returns:
         A row a scheme, and a sentence for each that was left out.
     """
-    corners = truth.vertices[truth.triangulated().faces[3]]
+    corners = truth.vertices[truth.triangulate().faces[3]]
     true_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     true_normals /= np.linalg.norm(true_normals, axis=1, keepdims=True)
     rows, left_out = [], []
@@ -59,9 +59,9 @@ def compare(mesh: ControlMesh, truth: ControlMesh, levels: int) -> tuple[list[Ro
         if 3 not in scheme.takes and len(mesh.faces[3]):
             left_out.append(f"{name} takes quads only")
             continue
-        suited = mesh.triangulated() if 4 not in scheme.takes else mesh
+        suited = mesh.triangulate() if 4 not in scheme.takes else mesh
         topology = build_topology(suited, scheme, levels)
-        rows.append(_measured(name, scheme, topology, suited.control(), corners, true_normals))
+        rows.append(_measure(name, scheme, topology, suited.control(), corners, true_normals))
         if scheme.interpolates:
             continue
         try:
@@ -70,11 +70,11 @@ def compare(mesh: ControlMesh, truth: ControlMesh, levels: int) -> tuple[list[Ro
         except ValueError as error:
             left_out.append(f"{name}, solved: {str(error).split('.')[0]}")
             continue
-        rows.append(_measured(f"{name}, solved", scheme, topology, control, corners, true_normals))
+        rows.append(_measure(f"{name}, solved", scheme, topology, control, corners, true_normals))
     return rows, left_out
 
 
-def _measured(name, scheme, topology, control, corners, true_normals: Float[np.ndarray, "t 3"]) -> Row:
+def _measure(name, scheme, topology, control, corners, true_normals: Float[np.ndarray, "t 3"]) -> Row:
     surface = jax.block_until_ready(refine(scheme, topology, control))
     start = time.perf_counter()
     jax.block_until_ready(refine(scheme, topology, control))
@@ -120,7 +120,7 @@ def draw(path: Path, rows: Sequence[Row], truth: ControlMesh) -> None:
         ax.set_title(title)
     for ax in axes[len(shown) :]:
         ax.axis("off")
-    with replacing(path) as unfinished:
+    with replace_file(path) as unfinished:
         figure.savefig(unfinished, dpi=120, format=path.suffix.lstrip(".") or "png")
 
 

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float, Int
 from ._control import Control
 from ._scheme.base import AbstractScheme
 from ._surface import RefinedSurface
-from ._topology import Topology
+from ._topology import Level, Topology
 from .half_edges import HalfEdges, half_edges
 
 
@@ -47,6 +47,24 @@ def control_faces_of(
 
     tree = KDTree(centres(control.vertices, topology.control_faces))
     return np.asarray(tree.query(centres(surface.vertices, surface.faces))[1])
+
+
+def faces_of_levels(topology: Topology) -> list[dict[int, Int[Array, "_ _"]]]:
+    """The faces of every level, the control mesh first.
+
+    Raises:
+        ValueError: the tables are of a linear scheme, or padded.
+    """
+    if not all(isinstance(level, Level) for level in topology.levels) or topology.real is not None:
+        raise ValueError(
+            "only tables of points and normals that are not padded tell the faces of their levels: take those of each "
+            "level from `build_topology`."
+        )
+    found = [topology.faces]
+    for _ in topology.levels:
+        # Child `c` of a face starts at its corner `c`; the fourth child of a triangle is its middle.
+        found.insert(0, {size: rows.reshape(-1, 4, size)[:, :size, 0] for size, rows in found[0].items()})
+    return found
 
 
 def _control_sides(topology: Topology) -> HalfEdges:

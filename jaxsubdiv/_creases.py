@@ -38,7 +38,7 @@ class Creases:
     vertex_sharpness: Numbers = INFINITE
 
 
-def sharpened(stage: Stage, creases: Creases) -> Stage:
+def sharpen(stage: Stage, creases: Creases) -> Stage:
     """The mesh with its creases.
 
     Raises:

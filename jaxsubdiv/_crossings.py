@@ -1,12 +1,12 @@
 """Where a surface goes through itself: edges of its triangles that pass through other triangles."""
 
-import importlib
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ._surface import RefinedSurface
+from .extras import import_extra
 
 _AT_ONCE = 1 << 18  # pairs of an edge and a triangle
 
@@ -35,7 +35,7 @@ def find_crossings(surface: RefinedSurface) -> Crossings:
     Raises:
         ImportError: ipctk, of the extra `contact`, is not installed.
     """
-    ipctk: Any = _import_ipctk()
+    ipctk = import_extra("ipctk", "contact", "searches for crossings")
     x = np.asfortranarray(np.asarray(surface.vertices, np.float64))
     triangles = np.asarray(surface.triangles())
     kept = np.flatnonzero((triangles != np.roll(triangles, 1, axis=1)).all(axis=1))  # a point or a line crosses nothing
@@ -74,13 +74,3 @@ def _pass_through(
     place = start + share[:, None] * along
     sides = [np.einsum("nx,nx->n", normal, np.cross(q - p, place - p)) for p, q in ((a, b), (b, c), (c, a))]
     return split & (np.stack(sides) > 0).all(axis=0), place
-
-
-def _import_ipctk() -> Any:
-    try:
-        return importlib.import_module("ipctk")
-    except ImportError as error:
-        raise ImportError(
-            f"crossings are searched by ipctk, which cannot be imported ({error}). Install it with: pip install "
-            "'jaxsubdiv[contact]'"
-        ) from error

@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._mesh import ControlMesh
 from ._surface import RefinedSurface
+from .extras import import_extra
 
 Numbers: TypeAlias = Sequence[Any] | np.ndarray
 
@@ -85,12 +86,11 @@ def draw_surface(
     Raises:
         ImportError: matplotlib is missing; it comes with the extra `viz`.
     """
-    try:
-        from matplotlib import colormaps
-        from matplotlib.cm import ScalarMappable
-        from matplotlib.colors import Normalize, to_rgb
-    except ImportError as error:
-        raise ImportError("pictures need matplotlib: pip install 'jaxsubdiv[viz]'") from error
+    import_extra("matplotlib", "viz", "pictures")
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize, to_rgb
+
     vertices, normals, faces = _arrays(surface)
     given = None if view is None else np.asarray(view, float)
     rows = given if given is not None and given.ndim == 2 else view_of(surface, given)
@@ -124,7 +124,7 @@ def draw_surface(
         mirrored = 2 * normal[:, 2:] * normal - (0, 0, 1)
         angle = np.arcsin(np.clip(mirrored[:, 1], -1, 1))
         colours = colours * np.where(np.sin(2 * _N_STRIPES * angle) > 0, 1.1, 0.25)[:, None]
-    colours = _lit(colours, normal, 0.5 if values is not None or stripes else 1.0)
+    colours = _light(colours, normal, 0.5 if values is not None or stripes else 1.0)
     if edges:
         colours = colours * (1 - (1 - _LINES) * _edge_cover(corners, is_edge, seen))[:, None]
 
@@ -167,7 +167,7 @@ def _rasterise(corners: Float[np.ndarray, "t 3 3"], frame: Numbers, samples: int
 
     first = np.maximum(np.ceil(y.min(axis=0)), 0).astype(int)
     last = np.minimum(np.floor(y.max(axis=0)), height - 1).astype(int)
-    of_row, y = _counted(first, np.where(doubled == 0, first - 1, last))
+    of_row, y = _list_between(first, np.where(doubled == 0, first - 1, last))
     p_row, rest = p[:, of_row], q[:, of_row] * y + r[:, of_row]
     crossing = -rest / np.where(p_row == 0, np.nan, p_row)
     start = np.where(p_row > 0, crossing, -np.inf).max(axis=0)
@@ -175,7 +175,7 @@ def _rasterise(corners: Float[np.ndarray, "t 3 3"], frame: Numbers, samples: int
     # Rounding must not open gaps between neighbours.
     start = np.ceil(np.clip(start - 1e-9, 0, width)).astype(int)
     stop = np.floor(np.clip(stop + 1e-9, -1, width - 1)).astype(int)
-    row, x = _counted(start, stop)
+    row, x = _list_between(start, stop)
     triangle, y = of_row[row], y[row]
 
     by_x, by_y, at_0 = ((part * corners[..., 2].T).sum(axis=0) for part in (p, q, r))  # depths are as linear
@@ -189,14 +189,14 @@ def _rasterise(corners: Float[np.ndarray, "t 3 3"], frame: Numbers, samples: int
     return _Seen(pixel[shown], triangle, weights, width, height, scale)
 
 
-def _counted(first: Int[np.ndarray, "n"], last: Int[np.ndarray, "n"]) -> tuple[np.ndarray, np.ndarray]:
+def _list_between(first: Int[np.ndarray, "n"], last: Int[np.ndarray, "n"]) -> tuple[np.ndarray, np.ndarray]:
     """All whole numbers from `first` to `last` of every row, and the row of each."""
     counts = np.maximum(last - first + 1, 0)
     row = np.repeat(np.arange(len(counts)), counts)
     return row, np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts) + first[row]
 
 
-def _lit(
+def _light(
     colours: Float[np.ndarray, "p 3"], normal: Float[np.ndarray, "p 3"], strength: float
 ) -> Float[np.ndarray, "p 3"]:
     """Two lights and a soft shine; with less strength colours stay what they are."""

@@ -29,7 +29,7 @@ class Frozen(eqx.Module):
         self.tree = jax.tree.unflatten(structure, bits)
         self.dtypes = tuple(None if dtype is None else dtype.name for dtype in dtypes)
 
-    def thawed(self) -> Any:
+    def thaw(self) -> Any:
         """The tree as it was given."""
         leaves, structure = jax.tree.flatten(self.tree)
         found = [

@@ -83,12 +83,12 @@ class SurfaceLayer(eqx.Module):
     @property
     def topology(self) -> Topology:
         """The tables."""
-        return self._fixed.thawed()[1]
+        return self._fixed.thaw()[1]
 
     @property
     def scheme(self) -> AbstractScheme:
         """The scheme with the h that it has now."""
-        scheme = self._fixed.thawed()[0]
+        scheme = self._fixed.thaw()[0]
         if self.parameter is None:
             return scheme
         low, high = self.h_range
@@ -147,7 +147,9 @@ class SurfaceLayer(eqx.Module):
         vertices = vertices.astype(dtype)
         normals = None if normals is None else jnp.broadcast_to(normals.astype(dtype), shape)
 
-        def one(topology: Topology, vertices: Any, normals: Any) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
+        def refine_one(
+            topology: Topology, vertices: Any, normals: Any
+        ) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
             if topology.real is not None:  # a spare vertex lies on the first one
                 there = topology.real.control_vertices[:, None]
                 vertices = jnp.where(there, vertices, vertices[:1])
@@ -158,9 +160,9 @@ class SurfaceLayer(eqx.Module):
             return surface.vertices, surface.normals
 
         if meshes:
-            found = jax.vmap(one)(topology, vertices, normals)
+            found = jax.vmap(refine_one)(topology, vertices, normals)
         else:
-            of_control = functools.partial(one, topology)
+            of_control = functools.partial(refine_one, topology)
             for _ in shape[:-2]:
                 of_control = jax.vmap(of_control)
             found = of_control(vertices, normals)

@@ -41,7 +41,7 @@ def entries(shape: tuple[int, int], *terms: Term) -> Matrix:
     return scipy.sparse.coo_array(triplets, shape=shape).tocsr()
 
 
-def scaled(weights: Float[np.ndarray, "n"], matrix: Matrix) -> Matrix:
+def scale_rows(weights: Float[np.ndarray, "n"], matrix: Matrix) -> Matrix:
     """Every row of a matrix times its weight."""
     return entries((len(weights), len(weights)), (np.arange(len(weights)), np.arange(len(weights)), weights)) @ matrix
 

@@ -61,11 +61,11 @@ def memory_of(
     scheme, topology = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), (scheme, topology))
 
     def surface(scheme: AbstractScheme, topology: Topology, control: Any) -> Any:
-        def one(x: Any, n: Any) -> Any:
+        def refine_one(x: Any, n: Any) -> Any:
             found = refine(scheme, topology, Control(x, n))
             return found.vertices, found.normals
 
-        return jax.vmap(one)(*control)
+        return jax.vmap(refine_one)(*control)
 
     def surface_and_gradient(scheme: AbstractScheme, topology: Topology, control: Any, slopes: Any) -> Any:
         def by_h(h: Any, control: Any) -> Any:

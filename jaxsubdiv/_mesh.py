@@ -15,7 +15,7 @@ from ._normals import Weights, estimate_normals
 from ._regions import Regions, as_regions
 from .errors import MeshError, name_rows
 from .half_edges import Faces, HalfEdges, half_edges
-from .linalg import of_moderate_length
+from .linalg import scale_to_moderate_length
 
 # A face whose area is under this part of its longest edge squared has no direction that rounding would not change.
 _FLAT = 1e-12
@@ -30,7 +30,7 @@ class ControlMesh:
         faces: corners of every face, counter-clockwise seen from outside, zero-based: a list of 3- and 4-tuples, an
             array `[t, 3]` or `[q, 4]`, a pair of such arrays, or a dict `{3: [t, 3], 4: [q, 4]}`.
         normals: `[v, 3]`, one a vertex, of any length, or None. A zero normal gives no bend from its end.
-        check: False puts off every check but those of the shapes, so that `repaired()` can be called.
+        check: False puts off every check but those of the shapes, so that `repair()` can be called.
         regions: of the faces, triangles first and then quads: `Regions`, or a name each, empty where a face lies in
             none; or None.
 
@@ -48,7 +48,7 @@ class ControlMesh:
     regions: Regions | None
     """Of the faces, triangles first and then quads, such as the groups of an OBJ file."""
     repairs: tuple[str, ...]
-    """What `repaired()` did to get here, a sentence each; empty otherwise."""
+    """What `repair()` did to get here, a sentence each; empty otherwise."""
 
     def __init__(
         self,
@@ -62,7 +62,7 @@ class ControlMesh:
     ):
         self.vertices = _rows_of_three(vertices, "vertices")
         self.faces, self._names = _sort_faces(faces)
-        self.normals = None if normals is None else of_moderate_length(_rows_of_three(normals, "normals"))
+        self.normals = None if normals is None else scale_to_moderate_length(_rows_of_three(normals, "normals"))
         self.regions = _regions_of_faces(regions, self.n_faces)
         self.repairs = tuple(repairs)
         self._checked = False
@@ -127,7 +127,7 @@ class ControlMesh:
             _check_areas(self)
             self._checked = True
 
-    def repaired(self, merge_within: float | None = None) -> "ControlMesh":
+    def repair(self, merge_within: float | None = None) -> "ControlMesh":
         """A mended copy; its `repairs` say what was done, in order.
 
         Merges doubled vertices, drops what is not finite and degenerate and repeated faces, splits edges with more
@@ -147,7 +147,7 @@ class ControlMesh:
 
         return repair(self, merge_within)
 
-    def triangulated(self) -> "ControlMesh":
+    def triangulate(self) -> "ControlMesh":
         """A copy with every quad cut from its first to its third corner, after the triangles that there are."""
         quads = self.faces[4]
         halves = np.stack([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
@@ -247,7 +247,7 @@ def _check_values(mesh: ControlMesh) -> None:
     if len(bad):
         raise MeshError(
             f"vertices {name_rows(bad)} have coordinates that are not finite. Drop them and the faces that use them, "
-            "or let `repaired()` do it."
+            "or let `repair()` do it."
         )
     first = 0
     for faces in mesh.faces.values():
@@ -255,7 +255,7 @@ def _check_values(mesh: ControlMesh) -> None:
         if len(repeated):
             raise MeshError(
                 f"{mesh.name_faces(repeated + first)} name a corner twice. A triangle stored as a quad must be given "
-                "as a triangle; `repaired()` does this, and drops what is left of fewer than three corners."
+                "as a triangle; `repair()` does this, and drops what is left of fewer than three corners."
             )
         first += len(faces)
     if mesh.normals is not None:
@@ -305,7 +305,7 @@ def _check_edges(mesh: ControlMesh) -> None:
         raise MeshError(
             f"edges {_name_edges(sides, crowded)} have more than two faces "
             f"({mesh.name_faces(np.unique(sides.face[np.isin(sides.edge, crowded)]))}). A surface cannot branch: drop "
-            "the faces that are one too many, or let `repaired()` split the surface there."
+            "the faces that are one too many, or let `repair()` split the surface there."
         )
     # Two faces that agree on their outside run along their edge in opposite directions.
     forward = np.bincount(sides.edge[sides.start < sides.end], minlength=len(sides.edges))
@@ -314,7 +314,7 @@ def _check_edges(mesh: ControlMesh) -> None:
         raise MeshError(
             f"the faces at edges {_name_edges(sides, torn)} are oriented oppositely "
             f"({mesh.name_faces(np.unique(sides.face[np.isin(sides.edge, torn)]))}). Reverse the corners of one side, "
-            "or let `repaired()` orient all alike."
+            "or let `repair()` orient all alike."
         )
 
 
@@ -327,7 +327,7 @@ def _check_areas(mesh: ControlMesh) -> None:
     if len(flat):
         raise MeshError(
             f"{mesh.name_faces(flat)} have no area: their corners lie on a line or on one another, or the sides of a "
-            "quad cross. Move the corners apart, or let `repaired()` drop or merge what is degenerate."
+            "quad cross. Move the corners apart, or let `repair()` drop or merge what is degenerate."
         )
 
 

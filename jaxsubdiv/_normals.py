@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ._fans import Fans
-from .linalg import PerRow, Rows, cross, dot, largest, take, unit, unit_or, where
+from .linalg import PerRow, Rows, cross, dot, max_abs, take, unit, unit_or, where
 
 Weights: TypeAlias = Literal["area", "uniform", "angle", "sphere"]
 """How the corner normals around a vertex are weighed in (6)."""
@@ -39,9 +39,9 @@ def corner_sum(
     if weights == "sphere":
         longest = jnp.maximum(dot(a, a), dot(b, b)).max(axis=0, keepdims=True, initial=0.0)
         longest = jnp.broadcast_to(longest, (*a.shape[:-1], 1))
-        a, b = _inverted(a, longest), _inverted(b, longest)
+        a, b = _invert(a, longest), _invert(b, longest)
     normals = _WEIGH[weights](cross(a, b), a, b)
-    return normals.sum(axis=0), _rounding(largest(normals).sum(axis=0))
+    return normals.sum(axis=0), _rounding(max_abs(normals).sum(axis=0))
 
 
 def ring_sum(
@@ -65,19 +65,19 @@ def ring_sum(
         spokes = [neighbour - centre for neighbour in ring]
         if weights == "sphere":
             longest = reduce(jnp.maximum, (dot(spoke, spoke) for spoke in spokes))
-            spokes = [_inverted(spoke, longest) for spoke in spokes]
+            spokes = [_invert(spoke, longest) for spoke in spokes]
         pairs = zip(spokes, [*spokes[1:], spokes[0]], strict=True)
         normals = [_WEIGH[weights](cross(a, b), a, b) for a, b in pairs]
         if there is not None:  # compiled code may round two copies of one position apart, and make a corner of them
             normals = [where(real, normal, 0.0) for real, normal in zip(there, normals, strict=True)]
-        return reduce(operator.add, normals), _rounding(reduce(operator.add, map(largest, normals)))
+        return reduce(operator.add, normals), _rounding(reduce(operator.add, map(max_abs, normals)))
     first, rest = ring[0], ring[1:]
     # The quads (first, rest_i, rest_i+1, rest_i+2), each by its diagonals.
     across = [rest[i + 1] - first for i in range(0, len(rest) - 1, 2)]
     along = [rest[i + 2] - rest[i] for i in range(0, len(rest) - 1, 2)]
     pairs = list(zip(across, along, strict=True))
     total = reduce(operator.add, (cross(a, b) for a, b in pairs))
-    return total, _rounding(reduce(operator.add, (largest(a) * largest(b) for a, b in pairs)))
+    return total, _rounding(reduce(operator.add, (max_abs(a) * max_abs(b) for a, b in pairs)))
 
 
 @partial(jax.jit, static_argnames="weights")
@@ -119,14 +119,14 @@ def chord_normals(n_a: Rows, n_b: Rows, d: Rows) -> Rows:
     """
     s = n_a + n_b
     along = unit(d)
-    return unit_or(s - dot(s, along) * along, 0.0, _rounding(largest(s)))
+    return unit_or(s - dot(s, along) * along, 0.0, _rounding(max_abs(s)))
 
 
 def _rounding(terms: Array) -> Array:
     return lax.stop_gradient(_ROUNDING_ERRORS * jnp.finfo(terms.dtype).eps * terms)
 
 
-def _inverted(edges: Rows, longest: PerRow) -> Rows:
+def _invert(edges: Rows, longest: PerRow) -> Rows:
     """Edges as the inversion in a sphere around their vertex leaves them: their raw cross products are those of the
     edges over both squared lengths.
 
@@ -160,7 +160,7 @@ def _angle(c: Rows, a: Rows, b: Rows) -> Rows:
 
 def _direction(c: Rows, a: Rows, b: Rows) -> Rows:
     # A fused multiply-add leaves a remainder even in the cross product of a vector with itself.
-    return unit_or(c, 0.0, _rounding(largest(a) * largest(b)))
+    return unit_or(c, 0.0, _rounding(max_abs(a) * max_abs(b)))
 
 
 _WEIGH: dict[str, Callable[[Rows, Rows, Rows], Rows]] = {

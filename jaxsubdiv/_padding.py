@@ -60,7 +60,7 @@ def pad_topology(topology: Topology, classes: Sequence[int] | None = None) -> To
         ValueError: the topology is of another scheme, has no vertex, or is padded already; or the mesh is larger than
             the last of the classes.
     """
-    return _padded([topology], classes)[0]
+    return _pad_to_common([topology], classes)[0]
 
 
 def stack_topologies(topologies: Iterable[Topology], classes: Sequence[int] | None = None) -> Topology:
@@ -79,7 +79,7 @@ def stack_topologies(topologies: Iterable[Topology], classes: Sequence[int] | No
     Raises:
         ValueError: there are none, they differ in their levels or options, or one cannot be padded.
     """
-    padded = _padded(list(topologies), classes)
+    padded = _pad_to_common(list(topologies), classes)
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded)
 
 
@@ -120,7 +120,7 @@ def cut_padding(topology: Topology, surface: RefinedSurface) -> RefinedSurface:
     return RefinedSurface(surface.vertices[rows], surface.normals[rows], kept)
 
 
-def _padded(topologies: list[Topology], classes: Sequence[int] | None) -> list[Topology]:
+def _pad_to_common(topologies: list[Topology], classes: Sequence[int] | None) -> list[Topology]:
     if not topologies:
         raise ValueError("there are no topologies to stack.")
     for topology in topologies:

@@ -5,11 +5,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._control import Control
+from ._control_faces import faces_of_levels
 from ._normals import fan_normals
 from ._scheme.base import AbstractScheme
 from ._surface import RefinedSurface
 from ._topology import Level, LimitMasks, Topology
-from .linalg import cross, largest, unit, unit_or
+from .linalg import cross, max_abs, unit, unit_or
 
 
 def refine(scheme: AbstractScheme, topology: Topology, control: Control) -> RefinedSurface:
@@ -60,6 +61,33 @@ def refine_vertices(scheme: AbstractScheme, topology: Topology, control: Control
     return _refine_vertices(scheme, topology, control)
 
 
+def refine_levels(scheme: AbstractScheme, topology: Topology, control: Control) -> tuple[RefinedSurface, ...]:
+    """The surfaces of all levels, from the control mesh itself to what `refine` returns: levels of detail, and whatever
+    looks at a coarse level and a fine one in one program.
+
+    Args:
+        scheme: of points and normals; one that keeps its old normals has those of a level in all later ones.
+        topology: tables from `build_topology`, not padded.
+        control: vertices `[v, 3]` in any unit, and normals `[v, 3]` of any length.
+
+    Raises:
+        ValueError: as `refine`; or the scheme is linear: its normals are those of the last mesh alone.
+    """
+    _check(scheme, topology, control)
+    faces = faces_of_levels(topology)
+    found = _refine_levels(scheme, topology, control)
+    return tuple(RefinedSurface(x, n, of_level) for (x, n), of_level in zip(found, faces, strict=True))
+
+
+@jax.jit
+def _refine_levels(
+    scheme: AbstractScheme, topology: Topology, control: Control
+) -> list[tuple[Float[Array, "_ 3"], Float[Array, "_ 3"]]]:
+    origin, levels = _split_levels(scheme, topology, control)
+    n_control = control.vertices.shape[0]
+    return [(jnp.concatenate([control.vertices, x[n_control:] + origin]), n) for x, n in levels]
+
+
 @jax.jit
 def _refine_vertices(scheme: AbstractScheme, topology: Topology, control: Control) -> Float[Array, "w 3"]:
     return _refine(scheme, topology, control)[0]
@@ -69,23 +97,32 @@ def _refine_vertices(scheme: AbstractScheme, topology: Topology, control: Contro
 def _refine(
     scheme: AbstractScheme, topology: Topology, control: Control
 ) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
-    # Scanners put the origin anywhere. Differences of vertices a metre from it lose digits in float32, most of all in
-    # the normals of small faces; every rule is free of the origin, so the middle of the mesh serves.
-    origin = jax.lax.stop_gradient(_middle(topology, control.vertices))
-    x, n = control.vertices - origin, unit(control.normals)
-    h = None if scheme.h is None else scheme.h.astype(x.dtype)
-    for i, level in enumerate(topology.levels):
-        last = i == len(topology.levels) - 1
-        recompute = scheme.recomputes_normals or (topology.mesh_normals and last)
-        x, n = scheme.refine_level(h if h is None or h.ndim == 0 else h[i], level, x, n, recompute)
+    origin, levels = _split_levels(scheme, topology, control)
+    x, n = levels[-1]
     if topology.limit is not None:
-        x, n = _at_limit(topology, topology.limit, x, scheme)
+        x, n = _move_to_limit(topology, topology.limit, x, scheme)
     elif topology.fans is not None:
         n = fan_normals(topology.fans, x, x, jnp.zeros_like(x), scheme.weights)
     if not scheme.interpolates:
         return x + origin, n
     n_control = control.vertices.shape[0]
     return jnp.concatenate([control.vertices, x[n_control:] + origin]), n
+
+
+def _split_levels(
+    scheme: AbstractScheme, topology: Topology, control: Control
+) -> tuple[Float[Array, "1 3"], list[tuple[Float[Array, "_ 3"], Float[Array, "_ 3"]]]]:
+    """The middle of the mesh, and about it the vertices and normals of all levels, the control mesh first."""
+    # Scanners put the origin anywhere. Differences of vertices a metre from it lose digits in float32, most of all in
+    # the normals of small faces; every rule is free of the origin, so the middle of the mesh serves.
+    origin = jax.lax.stop_gradient(_middle(topology, control.vertices))
+    levels = [(control.vertices - origin, unit(control.normals))]
+    h = None if scheme.h is None else scheme.h.astype(control.vertices.dtype)
+    for i, level in enumerate(topology.levels):
+        last = i == len(topology.levels) - 1
+        recompute = scheme.recomputes_normals or (topology.mesh_normals and last)
+        levels.append(scheme.refine_level(h if h is None or h.ndim == 0 else h[i], level, *levels[-1], recompute))
+    return origin, levels
 
 
 def _middle(topology: Topology, x: Float[Array, "v 3"]) -> Float[Array, "1 3"]:
@@ -96,7 +133,7 @@ def _middle(topology: Topology, x: Float[Array, "v 3"]) -> Float[Array, "1 3"]:
     return jnp.sum(jnp.where(real, x, 0.0), axis=0, keepdims=True) / jnp.sum(real).astype(x.dtype)
 
 
-def _at_limit(
+def _move_to_limit(
     topology: Topology, limit: LimitMasks, x: Float[Array, "w 3"], scheme: AbstractScheme
 ) -> tuple[Float[Array, "w 3"], Float[Array, "w 3"]]:
     """Every vertex in its place on the limit surface, and the normal there; that of the mesh where it has none."""
@@ -106,7 +143,7 @@ def _at_limit(
     if limit.tangents is None:
         return points, n
     first, second = (tangent(x) for tangent in limit.tangents)
-    rounding = 16 * jnp.finfo(x.dtype).eps * largest(first) * largest(second)
+    rounding = 16 * jnp.finfo(x.dtype).eps * max_abs(first) * max_abs(second)
     return points, unit_or(cross(first, second), n, rounding)
 
 

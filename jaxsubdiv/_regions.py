@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Int
 
 
-def _whole(value: object) -> Int[np.ndarray, "n"]:
+def _check_whole(value: object) -> Int[np.ndarray, "n"]:
     rows = np.asarray(value)
     if rows.ndim != 1 or rows.dtype.kind not in "iu":
         raise ValueError(
@@ -33,7 +33,7 @@ class Regions(eqx.Module):
         ValueError: a row names a region that there is not; a name is empty, or given twice.
     """
 
-    rows: Int[np.ndarray, "n"] = eqx.field(converter=_whole)
+    rows: Int[np.ndarray, "n"] = eqx.field(converter=_check_whole)
     names: tuple[str, ...] = eqx.field(converter=_words, static=True)
 
     def __check_init__(self):

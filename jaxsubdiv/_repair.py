@@ -28,7 +28,7 @@ _MOST_PASSES = 8  # a mesh that was split is repaired until nothing changes: two
 
 
 def repair(mesh: ControlMesh, merge_within: float | None) -> ControlMesh:
-    """What `ControlMesh.repaired` says.
+    """What `ControlMesh.repair` says.
 
     Vertices and faces keep their order. A vertex vanishes only where it was merged into an earlier one or is not
     finite; copies made by splitting come last, as among the triangles do those that were quads with a repeated corner.
@@ -58,7 +58,7 @@ def _repair_once(mesh: ControlMesh, merge_within: float | None) -> tuple[Control
     reversed_faces = _orient(work)
     normals = None if mesh.normals is None else _mend_normals(work, _take_normals(work, mesh.normals), reversed_faces)
     # Vertices doubled on purpose, to part two solids that touch, were merged and split into the same rows again.
-    notes = () if _unchanged(work, normals) else work.notes
+    notes = () if _is_unchanged(work, normals) else work.notes
     regions = None if mesh.regions is None else mesh.regions.take(work.origins)
     return ControlMesh(work.vertices, work.faces, normals, repairs=notes, regions=regions), was_split
 
@@ -81,13 +81,13 @@ class _Work:
     @property
     def corners(self) -> Int[np.ndarray, "s"]:
         """The corners of all faces in a row, numbered as half-edges are."""
-        return _in_a_row(self.faces)
+        return _flatten(self.faces)
 
     def set_corners(self, corners: Int[np.ndarray, "s"]) -> None:
         triangles, quads = np.split(corners, [self.faces[3].size])
         self.faces = {3: triangles.reshape(-1, 3), 4: quads.reshape(-1, 4)}
 
-    def by_size(self, rows: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    def split_by_size(self, rows: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
         """One value a face, parted into those of the triangles and those of the quads."""
         return zip((3, 4), np.split(rows, [len(self.faces[3])]), strict=True)
 
@@ -104,13 +104,13 @@ class _Work:
             return
         if bad.all():
             raise MeshError(f"nothing is left of the mesh: its repair drops the last {_count(bad, 'face')}, {which}.")
-        self.sources = {size: self.sources[size][~part] for size, part in self.by_size(bad)}
-        self.faces = {size: self.faces[size][~part] for size, part in self.by_size(bad)}
+        self.sources = {size: self.sources[size][~part] for size, part in self.split_by_size(bad)}
+        self.faces = {size: self.faces[size][~part] for size, part in self.split_by_size(bad)}
         self.origins = self.origins[~bad]
         self.notes.append(f"Dropped {_count(bad, 'face')} {which}{after}.")
 
 
-def _in_a_row(faces: Faces) -> Int[np.ndarray, "s"]:
+def _flatten(faces: Faces) -> Int[np.ndarray, "s"]:
     return np.concatenate([faces[3].ravel(), faces[4].ravel()])
 
 
@@ -119,7 +119,7 @@ def _count(flags: np.ndarray | np.integer | int, one: str, more: str | None = No
     return f"{n} {one if n == 1 else more or one + 's'}"
 
 
-def _unchanged(work: _Work, normals: Float[np.ndarray, "v 3"] | None) -> bool:
+def _is_unchanged(work: _Work, normals: Float[np.ndarray, "v 3"] | None) -> bool:
     before, after = work.input, (work.vertices, work.faces[3], work.faces[4])
     same = map(np.array_equal, (before.vertices, before.faces[3], before.faces[4]), after)
     return all(same) and (before.normals is None or normals is None or np.array_equal(before.normals, normals))
@@ -133,7 +133,7 @@ def _merge_doubled(work: _Work, within: float | None) -> None:
     if within is not None and not 0 <= within < np.inf:
         raise MeshError(f"`merge_within` must be a length, zero or more; got {within}.")
     used = np.unique(work.corners)
-    used = used[_finite(work.vertices[used])]
+    used = used[_is_finite(work.vertices[used])]
     if len(used) == 0:
         return
     at = work.vertices[used]
@@ -154,16 +154,16 @@ def _merge_doubled(work: _Work, within: float | None) -> None:
         work.notes.append(f"Merged {which} into others no further than {within:.3g} away.")
 
 
-def _finite(rows: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+def _is_finite(rows: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
     return np.asarray(np.isfinite(rows).all(axis=1))
 
 
 def _drop_not_finite(work: _Work) -> None:
-    bad = ~_finite(work.vertices)
+    bad = ~_is_finite(work.vertices)
     if bad.any():
         work.notes.append(f"Dropped {_count(bad, 'vertex', 'vertices')} whose coordinates are not finite.")
         in_face = np.concatenate([bad[work.faces[size]].any(axis=1) for size in (3, 4)])
-        work.drop_faces(in_face, "with a corner that is not finite", _opened(work, in_face))
+        work.drop_faces(in_face, "with a corner that is not finite", _count_opened(work, in_face))
         work.take_vertices(np.flatnonzero(~bad))
 
 
@@ -173,7 +173,7 @@ def _drop_degenerate(work: _Work) -> None:
     distinct = np.concatenate([_distinct_corners(work.faces[size]) for size in (3, 4)])
     work.drop_faces(distinct < 3, "with fewer than three distinct corners")
     flat = zero_area(work.vertices, work.faces)
-    work.drop_faces(flat, "without area", _opened(work, flat))
+    work.drop_faces(flat, "without area", _count_opened(work, flat))
 
 
 def _shrink_quads(work: _Work) -> None:
@@ -181,7 +181,7 @@ def _shrink_quads(work: _Work) -> None:
     repeats = quads == np.roll(quads, -1, axis=1)
     shrink = (repeats.sum(axis=1) == 1) & (_distinct_corners(quads) == 3)
     if shrink.any():
-        (_, of_triangles), (_, of_quads) = work.by_size(work.origins)
+        (_, of_triangles), (_, of_quads) = work.split_by_size(work.origins)
         work.origins = np.concatenate([of_triangles, of_quads[shrink], of_quads[~shrink]])
         work.faces, work.sources = (
             {
@@ -197,17 +197,17 @@ def _distinct_corners(faces: Int[np.ndarray, "f k"]) -> Int[np.ndarray, "f"]:
     return 1 + (np.diff(np.sort(faces, axis=1), axis=1) != 0).sum(axis=1)
 
 
-def _opened(work: _Work, dropped: Bool[np.ndarray, "f"]) -> str:
+def _count_opened(work: _Work, dropped: Bool[np.ndarray, "f"]) -> str:
     """Says how many edges lose one of their two faces, if any."""
     sides = half_edges(work.faces)
     gone = np.bincount(sides.edge, weights=dropped[sides.face])
     left = np.bincount(sides.edge) - gone
     # A folded quad has two sides on one edge; where both go, an open edge was open before.
     opened = (left == 1) & (gone % 2 == 1)
-    return _opening(opened)
+    return _describe_opened(opened)
 
 
-def _opening(opened: np.ndarray | np.integer) -> str:
+def _describe_opened(opened: np.ndarray | np.integer) -> str:
     return f", which opened {_count(opened, 'boundary edge')}" if np.any(opened) else ""
 
 
@@ -234,10 +234,10 @@ def _split_crowded_edges(work: _Work) -> bool:
     crowded = counts > 2
     if not crowded.any():
         return False
-    corners = _by_face(work.vertices, work.faces)
-    at_edges = np.split(_sides_on(sides, crowded), np.cumsum(counts[crowded])[:-1])
-    after = _corners_after(work.faces)
-    given, sound = _given_edges(_in_a_row(work.sources), after)
+    corners = _make_corner_lookup(work.vertices, work.faces)
+    at_edges = np.split(_find_sides(sides, crowded), np.cumsum(counts[crowded])[:-1])
+    after = _find_next_corners(work.faces)
+    given, sound = _given_edges(_flatten(work.sources), after)
     signs = np.ones(len(work.origins), int) if sound else _signs(work, sides)[0]
     sheets = [_pair_up(corners, sides, signs, given, at) for at in at_edges]
     fans = _fans(sides, after, sheets)
@@ -248,7 +248,7 @@ def _split_crowded_edges(work: _Work) -> bool:
     opened = np.sum(np.bincount(half_edges(work.faces).edge) == 1) - np.sum(counts == 1)
     work.notes.append(
         f"Split the surface at {_count(crowded, 'edge')} with more than two faces: copied "
-        f"{_count(n_copied, 'vertex', 'vertices')}{_opening(opened)}."
+        f"{_count(n_copied, 'vertex', 'vertices')}{_describe_opened(opened)}."
     )
     return True
 
@@ -270,20 +270,20 @@ def _copy_fans(work: _Work, fans: Int[np.ndarray, "s"], at_crowded: Bool[np.ndar
     vertex[copied] = len(work.rows) - len(copied) + np.arange(len(copied))
     work.set_corners(vertex[fans])
     places = work.rows.copy()
-    places[vertex[touching]] = _in_a_row(work.sources)[first[touching]]
+    places[vertex[touching]] = _flatten(work.sources)[first[touching]]
     further = np.ones(len(places), bool)
     further[np.unique(places, return_index=True)[1]] = False
     work.take_vertices(np.lexsort((places, further)))
     return len(copied)
 
 
-def _by_face(vertices: Float[np.ndarray, "v 3"], faces: Faces) -> Callable[[int], Float[np.ndarray, "k 3"]]:
+def _make_corner_lookup(vertices: Float[np.ndarray, "v 3"], faces: Faces) -> Callable[[int], Float[np.ndarray, "k 3"]]:
     """Positions of the corners of the face in a row."""
     n_triangles = len(faces[3])
     return lambda row: vertices[faces[3][row] if row < n_triangles else faces[4][row - n_triangles]]
 
 
-def _sides_on(sides: HalfEdges, chosen: Bool[np.ndarray, "e"]) -> Int[np.ndarray, "n"]:
+def _find_sides(sides: HalfEdges, chosen: Bool[np.ndarray, "e"]) -> Int[np.ndarray, "n"]:
     """The half-edges on the chosen edges, edge by edge."""
     rows = np.flatnonzero(chosen[sides.edge])
     return rows[np.argsort(sides.edge[rows], kind="stable")]
@@ -291,7 +291,7 @@ def _sides_on(sides: HalfEdges, chosen: Bool[np.ndarray, "e"]) -> Int[np.ndarray
 
 def _pairs_of_sides(sides: HalfEdges) -> Int[np.ndarray, "n 2"]:
     """The two half-edges on every edge of two faces."""
-    return _sides_on(sides, np.bincount(sides.edge) == 2).reshape(-1, 2)
+    return _find_sides(sides, np.bincount(sides.edge) == 2).reshape(-1, 2)
 
 
 def _given_edges(sources: Int[np.ndarray, "s"], after: Int[np.ndarray, "s"]) -> tuple[Int[np.ndarray, "s"], bool]:
@@ -336,7 +336,7 @@ def _pair_up(
     return sheets + [(int(at[i]),) for i in sorted(single)]
 
 
-def _corners_after(faces: Faces) -> Int[np.ndarray, "s"]:
+def _find_next_corners(faces: Faces) -> Int[np.ndarray, "s"]:
     """For every corner the next one of its face."""
     triangles, quads = np.split(np.arange(faces[3].size + faces[4].size), [faces[3].size])
     return np.concatenate([np.roll(f, -1, axis=1).ravel() for f in (triangles.reshape(-1, 3), quads.reshape(-1, 4))])
@@ -390,7 +390,7 @@ def _orient(work: _Work) -> Bool[np.ndarray, "f"]:
         work.notes.append(f"Reversed {_count(reverse & ~whole, 'face')} to agree with the rest of the surface.")
     if n_parts:
         work.notes.append(f"Turned {_count(n_parts, 'closed component')} ({_count(whole, 'face')}) outwards.")
-    for size, backwards in work.by_size(reverse):
+    for size, backwards in work.split_by_size(reverse):
         for faces in (work.faces, work.sources):
             turned = faces[size].copy()
             turned[backwards] = np.roll(turned[backwards, ::-1], 1, axis=1)  # the first corner stays the first
@@ -410,7 +410,7 @@ def _signs(work: _Work, sides: HalfEdges) -> tuple[Int[np.ndarray, "f"], Int[np.
     size = np.linalg.norm(areas, axis=1)
     volume = np.bincount(part, signs * np.einsum("fx,fx->f", middles, areas)) / 3
     total, votes = np.bincount(part, size), np.bincount(part, signs * size)
-    decides = np.where(_closed(part, sides) & (np.abs(volume) > _HOLLOW * total**1.5), volume, votes)
+    decides = np.where(_is_closed(part, sides) & (np.abs(volume) > _HOLLOW * total**1.5), volume, votes)
     first = np.unique(part, return_index=True)[1]
     decides = np.where(np.abs(decides) > 0, decides, signs[first])
     return np.where(decides[part] < 0, -signs, signs), part
@@ -438,7 +438,7 @@ def _agreeing_signs(work: _Work, sides: HalfEdges) -> tuple[Int[np.ndarray, "f"]
     return np.where(up < down, 1, -1), part
 
 
-def _closed(part: Int[np.ndarray, "f"], sides: HalfEdges) -> Bool[np.ndarray, "_"]:
+def _is_closed(part: Int[np.ndarray, "f"], sides: HalfEdges) -> Bool[np.ndarray, "_"]:
     """For every component whether each of its edges has an even number of its faces."""
     keys = part[sides.face].astype(np.int64) * len(sides.edges) + sides.edge
     keys, counts = np.unique(keys, return_counts=True)
@@ -454,12 +454,12 @@ def _take_normals(work: _Work, given: Float[np.ndarray, "n 3"]) -> Float[np.ndar
     NaN where nothing is left of that mean. Counted are the vertices whose faces came along.
     """
     normals = given[work.rows]
-    pairs = np.unique(np.stack([work.corners, _in_a_row(work.sources)], axis=1), axis=0)
+    pairs = np.unique(np.stack([work.corners, _flatten(work.sources)], axis=1), axis=0)
     vertex, values = pairs[:, 0], given[pairs[:, 1]]
     used, first = np.unique(vertex, return_index=True)
     normals[used] = values[first]
     differ = np.unique(vertex[(values != normals[vertex]).any(axis=1)])
-    counted = np.isin(vertex, differ) & _finite(values)
+    counted = np.isin(vertex, differ) & _is_finite(values)
     total = np.zeros_like(normals)
     np.add.at(total, vertex[counted], _unit(values[counted]))
     remains = np.linalg.norm(total[differ], axis=1, keepdims=True) > 1e-6
@@ -478,11 +478,11 @@ def _mend_normals(
     vertices = work.vertices
     total = np.zeros_like(vertices)
     touched = np.zeros(len(total), bool)
-    for size, part in work.by_size(reversed_faces):
+    for size, part in work.split_by_size(reversed_faces):
         faces = work.faces[size]
         np.add.at(total, faces, vector_areas(vertices[faces])[:, None])
         touched[faces[part]] = True
-    bad = ~_finite(normals)
+    bad = ~_is_finite(normals)
     normals = np.where(bad[:, None], _unit(total), normals)
     against = touched & ~bad & (np.einsum("vx,vx->v", normals, total) < 0)
     if bad.any():

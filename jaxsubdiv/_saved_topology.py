@@ -16,7 +16,7 @@ from ._masks import MaskGroup, Masks
 from ._scheme.bezier_triangle import PatchLevel, Places
 from ._topology import Level, LimitMasks, MaskLevel, Real, Topology
 from .archives import read_arrays
-from .files import replacing
+from .files import replace_file
 
 _VERSION = 1
 _KINDS = {
@@ -33,8 +33,8 @@ def save_topology(path: str | os.PathLike[str], topology: Topology) -> None:
         OSError: the file cannot be written.
     """
     arrays: dict[str, Any] = {}
-    text = json.dumps({"version": _VERSION, "tables": _plain(topology, arrays)})
-    with replacing(path) as unfinished, open(unfinished, "wb") as file:
+    text = json.dumps({"version": _VERSION, "tables": _encode(topology, arrays)})
+    with replace_file(path) as unfinished, open(unfinished, "wb") as file:
         np.savez(file, about=np.array(text), **arrays)
 
 
@@ -52,7 +52,7 @@ def load_topology(path: str | os.PathLike[str]) -> Topology:
             raise ValueError(
                 f"a topology of version {about['version']!r}, but this release reads {_VERSION}. Update it."
             )
-        topology = _built(about["tables"], arrays)
+        topology = _decode(about["tables"], arrays)
     except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{os.fspath(path)}: no saved topology, or a damaged one: {error}") from None
     if not isinstance(topology, Topology):
@@ -60,40 +60,40 @@ def load_topology(path: str | os.PathLike[str]) -> Topology:
     return topology
 
 
-def _plain(value: Any, arrays: dict[str, Any]) -> Any:
+def _encode(value: Any, arrays: dict[str, Any]) -> Any:
     """A value as JSON has it; its arrays go to `arrays`, and their names stay."""
     if isinstance(value, eqx.Module):
         name = type(value).__name__
         if _KINDS.get(name) is not type(value):
             raise ValueError(f"a topology with {name} has no file format; those of the package's schemes do.")
-        return {"kind": name} | {field: _plain(part, arrays) for field, part in vars(value).items()}
+        return {"kind": name} | {field: _encode(part, arrays) for field, part in vars(value).items()}
     if isinstance(value, jax.Array):
         name = f"table_{len(arrays)}"
         arrays[name] = np.asarray(value)
         return {"array": name}
     if isinstance(value, tuple):
-        return [_plain(part, arrays) for part in value]
+        return [_encode(part, arrays) for part in value]
     if isinstance(value, dict):  # faces by their number of corners
-        return {"faces": {str(size): _plain(part, arrays) for size, part in value.items()}}
+        return {"faces": {str(size): _encode(part, arrays) for size, part in value.items()}}
     return value
 
 
-def _built(value: Any, arrays: dict[str, np.ndarray | None]) -> Any:
+def _decode(value: Any, arrays: dict[str, np.ndarray | None]) -> Any:
     if isinstance(value, list):
-        return tuple(_built(part, arrays) for part in value)
+        return tuple(_decode(part, arrays) for part in value)
     if not isinstance(value, dict):
         return value
     if "array" in value:
         return jax.numpy.asarray(arrays[value["array"]])  # an array of text is refused here
     if "kind" not in value:
-        return {int(size): _built(part, arrays) for size, part in value["faces"].items()}
+        return {int(size): _decode(part, arrays) for size, part in value["faces"].items()}
     kind = _KINDS[value["kind"]]
     module = object.__new__(kind)  # past the converters, which take the arrays of numpy that tables are built from
     hints = get_type_hints(kind)
     for field in dataclasses.fields(kind):
         # A field with a default may be younger than the file.
         plain = value[field.name] if field.default is dataclasses.MISSING else value.get(field.name, field.default)
-        part = _built(plain, arrays)
+        part = _decode(plain, arrays)
         if not _fits(part, hints[field.name]):
             raise ValueError(f"`{field.name}` of {value['kind']} is not as it should be.")
         object.__setattr__(module, field.name, part)

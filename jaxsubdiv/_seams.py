@@ -51,10 +51,10 @@ def split_normals(mesh: ControlMesh, edges: Numbers | None = None, *, angle: flo
     sides = sides_of(stage)
     sharp = np.zeros(len(stage.edges), bool)
     if edges is None:
-        sharp = _turned(mesh, stage, sides) > np.radians(float(angle or 0.0))
+        sharp = _turning_angle(mesh, stage, sides) > np.radians(float(angle or 0.0))
     else:
         sharp[edge_rows(stage, np.asarray(edges, np.int64).reshape(-1, 2))] = True
-    corner, origin = _one_vertex_a_side(stage, sides, sharp)
+    corner, origin = _split_vertices(stage, sides, sharp)
     inside = np.flatnonzero(sharp & (stage.right >= 0))
     left, right = stage.left[inside], stage.right[inside]
     joined = (corner[left] == corner[sides.next[right]]) & (corner[right] == corner[sides.next[left]])
@@ -77,7 +77,7 @@ def split_normals(mesh: ControlMesh, edges: Numbers | None = None, *, angle: flo
     return SplitMesh(ControlMesh(split.vertices, faces, np.where(several[:, None], own, mesh.normals[origin])), origin)
 
 
-def _turned(mesh: ControlMesh, stage: Stage, sides: Sides) -> Float[np.ndarray, "e"]:
+def _turning_angle(mesh: ControlMesh, stage: Stage, sides: Sides) -> Float[np.ndarray, "e"]:
     """Angle between the faces at every edge; 0 at a boundary."""
     normals = np.concatenate([vector_areas(mesh.vertices[rows]) for _, rows in sorted(mesh.faces.items())])
     a, b = normals[sides.face[stage.left]], normals[sides.face[stage.right]]
@@ -85,7 +85,7 @@ def _turned(mesh: ControlMesh, stage: Stage, sides: Sides) -> Float[np.ndarray, 
     return np.where(stage.right < 0, 0.0, angle)
 
 
-def _one_vertex_a_side(
+def _split_vertices(
     stage: Stage, sides: Sides, sharp: Bool[np.ndarray, "e"]
 ) -> tuple[Int[np.ndarray, "s"], Int[np.ndarray, "w"]]:
     """The vertex of every corner once the sharp edges are cut, and the old vertex of each."""
@@ -111,7 +111,7 @@ def _one_vertex_a_side(
     return label[part], np.concatenate([np.arange(n), owner[copy]])
 
 
-def sewn(stage: Stage, vertices: Float[np.ndarray, "v 3"], origin: Numbers) -> Stage:
+def sew(stage: Stage, vertices: Float[np.ndarray, "v 3"], origin: Numbers) -> Stage:
     """The mesh with its seams: the pairs of boundary edges whose ends have the same origins.
 
     Raises:

@@ -120,7 +120,7 @@ def _search(
     if chosen is not None:
         keys = jnp.where(chosen.any(axis=1), keys, most)
 
-    def closer(found: _Found) -> Bool[Array, ""]:
+    def is_closer(found: _Found) -> Bool[Array, ""]:
         return lax.bitcast_convert_type(found.key & ~number, point.dtype) < found.squared
 
     def look(found: _Found) -> _Found:
@@ -143,7 +143,7 @@ def _search(
     nothing = (first & 0).astype(jnp.int32)
     zero = nothing.astype(point.dtype)
     none = _Found(first, zero + jnp.inf, nothing, jnp.stack([zero, zero]))
-    found = lax.while_loop(closer, look, none)
+    found = lax.while_loop(is_closer, look, none)
     return found.triangle, found.uv
 
 

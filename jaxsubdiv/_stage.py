@@ -131,7 +131,7 @@ def hybrid_split(stage: Stage) -> Stage:
         count = len(stage.faces[size])
         return (2 * n_edges + (3 * n_triangles if size == 4 else 0) + numbers(size * count)).reshape(count, size)
 
-    def back(table: Int[np.ndarray, "_ _"]) -> Int[np.ndarray, "_ _"]:
+    def shift_back(table: Int[np.ndarray, "_ _"]) -> Int[np.ndarray, "_ _"]:
         return np.roll(table, 1, axis=1)
 
     def halves(size: int) -> tuple[Int[np.ndarray, "_ _"], Int[np.ndarray, "_ _"]]:
@@ -145,16 +145,16 @@ def hybrid_split(stage: Stage) -> Stage:
     (near3, far3), (near4, far4) = halves(3), halves(4)
     inner3, inner4 = inner(3), inner(4)
 
-    corner_children = np.stack([triangles, q3, back(q3)], axis=2)
-    corner_edges = np.stack([near3, inner3, back(far3)], axis=2)
+    corner_children = np.stack([triangles, q3, shift_back(q3)], axis=2)
+    corner_edges = np.stack([near3, inner3, shift_back(far3)], axis=2)
     middle_edges = np.roll(inner3, -1, axis=1)
     faces = {
         3: np.concatenate([corner_children, q3[:, None]], axis=1).reshape(-1, 3),
-        4: np.stack([quads, q4, centre, back(q4)], axis=2).reshape(-1, 4),
+        4: np.stack([quads, q4, centre, shift_back(q4)], axis=2).reshape(-1, 4),
     }
     face_edges = {
         3: np.concatenate([corner_edges, middle_edges[:, None]], axis=1).reshape(-1, 3),
-        4: np.stack([near4, inner4, back(inner4), back(far4)], axis=2).reshape(-1, 4),
+        4: np.stack([near4, inner4, shift_back(inner4), shift_back(far4)], axis=2).reshape(-1, 4),
     }
 
     # The sides of the children, by corner of the parent: child `c` and which of its own sides.
@@ -175,7 +175,7 @@ def hybrid_split(stage: Stage) -> Stage:
         edges=np.concatenate(
             [
                 np.stack([stage.edges[:, 0], middle, middle, stage.edges[:, 1]], axis=1).reshape(-1, 2),
-                np.stack([q3, back(q3)], axis=2).reshape(-1, 2),
+                np.stack([q3, shift_back(q3)], axis=2).reshape(-1, 2),
                 np.stack([q4, centre], axis=2).reshape(-1, 2),
             ]
         ),
@@ -189,23 +189,23 @@ def hybrid_split(stage: Stage) -> Stage:
         right=np.concatenate(
             [
                 np.stack([right_end, right_start], axis=1).ravel(),
-                back(middle_side).ravel(),
+                shift_back(middle_side).ravel(),
                 (first_quad_side + 4 * np.roll(child4, -1, 1) + 2).ravel(),
             ]
         ),
         level=stage.level + 1,
-        edge_sharpness=_worn(stage.edge_sharpness, 2, 2 * n_edges + 3 * n_triangles + 4 * n_quads),
-        vertex_sharpness=_worn(stage.vertex_sharpness, 1, n + n_edges + n_quads),
-        seams=_halved(stage.seams),
+        edge_sharpness=_wear(stage.edge_sharpness, 2, 2 * n_edges + 3 * n_triangles + 4 * n_quads),
+        vertex_sharpness=_wear(stage.vertex_sharpness, 1, n + n_edges + n_quads),
+        seams=_halve(stage.seams),
     )
 
 
-def _halved(seams: Int[np.ndarray, "s 2"] | None) -> Int[np.ndarray, "t 2"] | None:
+def _halve(seams: Int[np.ndarray, "s 2"] | None) -> Int[np.ndarray, "t 2"] | None:
     """Seams of the next level: the first half of one edge lies on the second half of the other."""
     return None if seams is None else np.concatenate([2 * seams + (0, 1), 2 * seams + (1, 0)]).astype(np.int32)
 
 
-def _worn(sharpness: Float[np.ndarray, "n"] | None, children: int, total: int) -> Float[np.ndarray, "m"] | None:
+def _wear(sharpness: Float[np.ndarray, "n"] | None, children: int, total: int) -> Float[np.ndarray, "m"] | None:
     """Sharpness of the children, one less than their parent's; what is new beside them is smooth.
 
     Source: DeRose, Kass & Truong, Subdivision surfaces in character animation, 1998, the uniform rule.
@@ -213,11 +213,11 @@ def _worn(sharpness: Float[np.ndarray, "n"] | None, children: int, total: int) -
     if sharpness is None:
         return None
     worn = np.zeros(total)
-    worn[: children * len(sharpness)] = np.repeat(after_one_level(sharpness), children)
+    worn[: children * len(sharpness)] = np.repeat(wear(sharpness), children)
     return worn
 
 
-def after_one_level(sharpness: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def wear(sharpness: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """What one level leaves of a sharpness."""
     return np.where(sharpness >= INFINITE, INFINITE, np.maximum(sharpness - 1, 0))
 
@@ -242,10 +242,10 @@ def quad_split(stage: Stage) -> Stage:
     if stage.edge_sharpness is not None:
         parent = split.edges.max(axis=1) - n  # an edge of a parent joins an old vertex to an edge vertex
         halves = (split.edges.min(axis=1) < n) & (parent < n_edges)
-        worn = after_one_level(stage.edge_sharpness)
+        worn = wear(stage.edge_sharpness)
         edge_sharpness = np.where(halves, worn[np.where(halves, parent, 0)], 0.0)
     return split._replace(
-        edge_sharpness=edge_sharpness, vertex_sharpness=_worn(stage.vertex_sharpness, 1, first_centre)
+        edge_sharpness=edge_sharpness, vertex_sharpness=_wear(stage.vertex_sharpness, 1, first_centre)
     )
 
 

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from ._admissible import warn_of_folds
-from ._creases import Creases, Numbers, sharpened
+from ._creases import Creases, Numbers, sharpen
 from ._fans import Fans, as_table, group_corners, mesh_fans
 from ._masks import Masks
 from ._mesh import ControlMesh
-from ._seams import sewn
+from ._seams import sew
 from ._stage import Stage, numbers, stage_of
 from .errors import MeshError
 from .half_edges import Faces, half_edges
@@ -187,11 +187,11 @@ def build_topology(
                 f"{type(scheme).__name__} has no creases; CatmullClark and Loop do. In Interpolating and "
                 "CirclePreserving several normals at a vertex make one: see `split_normals`."
             )
-        stage = sharpened(stage, creases)
+        stage = sharpen(stage, creases)
     if seams is not None:
         if not scheme.takes_seams:
             raise ValueError(f"{type(scheme).__name__} has no seams; Interpolating and CirclePreserving do.")
-        stage = sewn(stage, mesh.vertices, seams)
+        stage = sew(stage, mesh.vertices, seams)
     tables = []
     for i in range(levels):
         recompute = scheme.recomputes_normals or (mesh_normals and i == levels - 1)
@@ -214,7 +214,7 @@ def _check_faces(mesh: ControlMesh, scheme: BuildsTables) -> None:
     kinds = {3: "triangles", 4: "quads"}
     both = "take a scheme for both, such as Interpolating or CatmullClark"
     ways = {
-        3: f"Cut the quads with `mesh.triangulated()`, or {both}.",
+        3: f"Cut the quads with `mesh.triangulate()`, or {both}.",
         4: f"Make quads of all faces first, as one level of CatmullClark does, or {both}.",
     }
     first = 0

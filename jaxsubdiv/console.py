@@ -9,7 +9,7 @@ from typing import Any
 
 
 @contextmanager
-def plain_warnings() -> Iterator[None]:
+def simplify_warnings() -> Iterator[None]:
     """Print warnings of the block as `warning: ...` on stderr, unless they are errors or recorded."""
     shown = warnings.showwarning
 
@@ -24,7 +24,7 @@ def plain_warnings() -> Iterator[None]:
 
 
 @contextmanager
-def lasting_streams() -> Iterator[None]:
+def survive_closed_streams() -> Iterator[None]:
     """Go on without words where stdout or stderr is closed, or is read by a command that ends before this one.
 
     Letters that the terminal's encoding lacks are printed as escapes.
@@ -74,12 +74,12 @@ class _Lasting:
         self._stream = self._nowhere
 
 
-def in_colour(text: str) -> str:
+def colour(text: str) -> str:
     """Text in yellow where stdout is a terminal, unless the environment has `NO_COLOR`."""
     return f"\x1b[33m{text}\x1b[0m" if sys.stdout.isatty() and not os.environ.get("NO_COLOR") else text
 
 
-def printable(text: str) -> str:
+def make_printable(text: str) -> str:
     """Text that can be written as UTF-8: bytes of a file's name that are no text become escapes such as `\\xe9`."""
     try:
         raw = text.encode("utf-8", "surrogateescape")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 @contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+def replace_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A path to write to; what was written takes the place of `path` once the block is left without an error.
 
     The file has its own name there, in a folder beside its place and so on the same disk: messages give its name, and

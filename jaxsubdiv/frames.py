@@ -11,6 +11,6 @@ AXES: dict[str, str] = {"RAS": "right, anterior, superior", "LPS": "left, poster
 """Where x, y and z point to: RAS is that of NIfTI and FreeSurfer, LPS that of DICOM, ITK and the files of 3D Slicer."""
 
 
-def in_frame(positions: Float[np.ndarray, "*n 3"], own: Frame, wanted: Frame) -> Float[np.ndarray, "*n 3"]:
+def convert_frame(positions: Float[np.ndarray, "*n 3"], own: Frame, wanted: Frame) -> Float[np.ndarray, "*n 3"]:
     """Positions of one frame in the other: x and y change their signs, or nothing does."""
     return positions if own == wanted else positions * np.array([-1.0, -1.0, 1.0])

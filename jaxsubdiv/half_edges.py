@@ -30,9 +30,9 @@ class HalfEdges(NamedTuple):
 
 def half_edges(faces: Faces) -> HalfEdges:
     """Half-edges of a mesh, and the edges that they lie on. The only place that sorts."""
-    start = _by_side(faces, 0)
-    end = _by_side(faces, 1)
-    before = _by_side(faces, -1)
+    start = _find_corners(faces, 0)
+    end = _find_corners(faces, 1)
+    before = _find_corners(faces, -1)
     sizes = np.concatenate([np.full(len(faces[size]), size) for size in sorted(faces)])
     face = np.repeat(np.arange(len(sizes)), sizes)
     low, high = np.minimum(start, end).astype(np.int64), np.maximum(start, end).astype(np.int64)
@@ -41,6 +41,6 @@ def half_edges(faces: Faces) -> HalfEdges:
     return HalfEdges(start, end, before, face, edge, np.stack(np.divmod(keys, stride), axis=1))
 
 
-def _by_side(faces: Faces, ahead: int) -> Int[np.ndarray, "s"]:
+def _find_corners(faces: Faces, ahead: int) -> Int[np.ndarray, "s"]:
     """For every half-edge the corner that lies `ahead` of its start."""
     return np.concatenate([np.roll(faces[size], -ahead, axis=1).ravel() for size in sorted(faces)])

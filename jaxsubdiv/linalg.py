@@ -50,23 +50,23 @@ else:
     Rows: TypeAlias = Float[Array, "*rows 3"] | Vectors
 
 
-def apart(rows: Rows) -> Vectors:
+def split_rows(rows: Rows) -> Vectors:
     """Rows as `Vectors`: a split and no slices, whose adjoint is one concatenation where those of slices are pads."""
     return rows if isinstance(rows, Vectors) else Vectors(*lax.split(rows, (1, 1, 1), axis=rows.ndim - 1))
 
 
-def together(vectors: Rows) -> Float[Array, "*rows 3"]:
+def join_rows(vectors: Rows) -> Float[Array, "*rows 3"]:
     """`Vectors` as rows."""
     if not isinstance(vectors, Vectors):
         return vectors
     return jnp.concatenate([vectors.x, vectors.y, vectors.z], axis=-1)
 
 
-def _like(given: Rows, found: Vectors) -> Any:
-    return found if isinstance(given, Vectors) else together(found)
+def _convert_like(given: Rows, found: Vectors) -> Any:
+    return found if isinstance(given, Vectors) else join_rows(found)
 
 
-def of_moderate_length(normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
+def scale_to_moderate_length(normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
     """Directions whose squares stay in the range of single precision: rows far from length 1 are scaled to it."""
     size = np.abs(normals).max(axis=1, keepdims=True, initial=0)
     far = np.isfinite(size) & (size > 0) & ((size < _SHORT) | (size > 1 / _SHORT))
@@ -83,7 +83,7 @@ def take_each(rows: Float[Array, "v _"], table: Int[Array, "m k"]) -> list[Float
     return list(lax.split(take(rows, table.T), (1,) * table.shape[1], axis=0))
 
 
-def kept_apart(stage: Callable) -> Callable:
+def compile_apart(stage: Callable) -> Callable:
     """A stage of a refinement that XLA's CPU backend compiles as a program of its own.
 
     Else it fuses a level into the gathers that read it, and computes every row again for each of its readers: 2 to 3
@@ -107,7 +107,7 @@ def kept_apart(stage: Callable) -> Callable:
     return run
 
 
-@kept_apart
+@compile_apart
 def _planes(rows: Float[Array, "v 3"], table: Int[Array, "m k"]) -> Float[Array, "3 k m"]:
     return jnp.moveaxis(take(rows, table.T), 2, 0)
 
@@ -121,19 +121,19 @@ def take_planes(rows: Float[Array, "v 3"], table: Int[Array, "m k"]) -> list[Vec
 
 def dot(a: Rows, b: Rows) -> PerRow:
     """Dot product of every row; the axis is kept, to multiply rows with."""
-    a, b = apart(a), apart(b)
+    a, b = split_rows(a), split_rows(b)
     return a.x * b.x + a.y * b.y + a.z * b.z
 
 
 def cross(a: Rows, b: Rows) -> Any:
     """Cross product of every row."""
-    p, q = apart(a), apart(b)
-    return _like(a, Vectors(p.y * q.z - p.z * q.y, p.z * q.x - p.x * q.z, p.x * q.y - p.y * q.x))
+    p, q = split_rows(a), split_rows(b)
+    return _convert_like(a, Vectors(p.y * q.z - p.z * q.y, p.z * q.x - p.x * q.z, p.x * q.y - p.y * q.x))
 
 
-def largest(a: Rows) -> PerRow:
+def max_abs(a: Rows) -> PerRow:
     """Largest absolute coordinate of every row, without a gradient: a scale that cannot under- or overflow."""
-    a = apart(lax.stop_gradient(a))
+    a = split_rows(lax.stop_gradient(a))
     return jnp.maximum(jnp.maximum(jnp.abs(a.x), jnp.abs(a.y)), jnp.abs(a.z))
 
 
@@ -162,9 +162,10 @@ def unit_or(v: Rows, fallback: Rows | float, vanishes_below: PerRow | float = 0.
         Rows of length 1, or `fallback`. The gradient in a vanishing row of `v` is 0.
     """
     if not isinstance(v, Vectors):
-        fallback = fallback if isinstance(fallback, float) else apart(jnp.broadcast_to(together(fallback), v.shape))
-        return together(unit_or(apart(v), fallback, vanishes_below))
-    scale = largest(v)
+        if not isinstance(fallback, float):
+            fallback = split_rows(jnp.broadcast_to(join_rows(fallback), v.shape))
+        return join_rows(unit_or(split_rows(v), fallback, vanishes_below))
+    scale = max_abs(v)
     there = scale > jnp.maximum(vanishes_below, jnp.finfo(scale.dtype).tiny)
     # Guarded inside and outside of the root: one guard alone leaves NaN in the gradient of the other branch.
     scaled = where(there, v, 1.0) / where(there, scale, 1.0)

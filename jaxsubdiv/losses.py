@@ -27,7 +27,7 @@ _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 
-def _of_each(quantity: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+def _vectorise(quantity: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """A function of one surface, and of arrays that belong to it, for any leading axes of them all.
 
     What the function takes by its name alone is the same for the whole batch.
@@ -35,7 +35,7 @@ def _of_each(quantity: Callable[_Arguments, _Result]) -> Callable[_Arguments, _R
     signature = inspect.signature(quantity)
 
     @functools.wraps(quantity)
-    def of_each(*arguments: Any, **named: Any) -> Any:
+    def call_each(*arguments: Any, **named: Any) -> Any:
         given = signature.bind(*arguments, **named)
         given.apply_defaults()
         surface, *arrays = given.args
@@ -44,13 +44,13 @@ def _of_each(quantity: Callable[_Arguments, _Result]) -> Callable[_Arguments, _R
         # Faces have leading axes only where the surfaces have different ones.
         of_faces = {size: 0 if rows.ndim > 2 else None for size, rows in surface.faces.items()}
 
-        def one(vertices: Any, normals: Any, faces: Any, *arrays: Any) -> Any:
-            return of_each(RefinedSurface(vertices, normals, faces), *arrays, **given.kwargs)
+        def call_one(vertices: Any, normals: Any, faces: Any, *arrays: Any) -> Any:
+            return call_each(RefinedSurface(vertices, normals, faces), *arrays, **given.kwargs)
 
         axes = (0, 0, of_faces, *(0 for _ in arrays))
-        return jax.vmap(one, in_axes=axes)(surface.vertices, surface.normals, surface.faces, *arrays)
+        return jax.vmap(call_one, in_axes=axes)(surface.vertices, surface.normals, surface.faces, *arrays)
 
-    return of_each
+    return call_each
 
 
 def _mean(rows: Float[Array, "p"], weights: Shaped[Array, "p"] | None) -> Float[Array, ""]:
@@ -62,7 +62,7 @@ def _mean(rows: Float[Array, "p"], weights: Shaped[Array, "p"] | None) -> Float[
     return jnp.where(total > 0, jnp.sum(weights * rows) / jnp.where(total > 0, total, 1.0), 0.0)
 
 
-@_of_each
+@_vectorise
 def closest_places(surface: RefinedSurface, points: Float[Array, "p 3"]) -> SurfacePoint:
     """Where the surface is closest to every point: `search_closest`, for any leading axes.
 
@@ -75,7 +75,7 @@ def closest_places(surface: RefinedSurface, points: Float[Array, "p 3"]) -> Surf
     return search_closest(surface, points.astype(surface.vertices.dtype))
 
 
-@_of_each
+@_vectorise
 def distances_to_surface(
     surface: RefinedSurface, points: Float[Array, "p 3"], at: SurfacePoint | None = None
 ) -> Float[Array, "p"]:
@@ -94,7 +94,7 @@ def distances_to_surface(
     return norm(points - evaluate(surface, at).points)[:, 0]
 
 
-@_of_each
+@_vectorise
 def distances_to_points(
     surface: RefinedSurface, points: Float[Array, "p 3"], weights: Float[Array, "p"] | None = None
 ) -> Float[Array, "v"]:
@@ -111,7 +111,7 @@ def distances_to_points(
     return found if there is None else jnp.where(there.any(), found, 0.0)
 
 
-@_of_each
+@_vectorise
 def chamfer_distance(
     surface: RefinedSurface,
     points: Float[Array, "p 3"],
@@ -132,7 +132,7 @@ def chamfer_distance(
     return _mean(there**2, weights) + _mean(back**2, surface.vertex_areas())
 
 
-@_of_each
+@_vectorise
 def normal_disagreement(
     surface: RefinedSurface,
     points: Float[Array, "p 3"],
@@ -158,7 +158,7 @@ def normal_disagreement(
     return _mean(1 - (cosines if oriented else cosines**2), weights)
 
 
-@_of_each
+@_vectorise
 def surface_area(surface: RefinedSurface, *, part: SurfacePart | None = None) -> Float[Array, ""]:
     """Area, 1/2 sum |(b - a) x (c - a)| over the triangles; a quad is two. The gradient by a flat triangle is 0.
 
@@ -171,7 +171,7 @@ def surface_area(surface: RefinedSurface, *, part: SurfacePart | None = None) ->
     return jnp.sum(norm(cross(b - a, c - a))) / 2
 
 
-@_of_each
+@_vectorise
 def enclosed_volume(surface: RefinedSurface, *, part: SurfacePart) -> Float[Array, ""]:
     """Volume inside, 1/6 sum a . (b x c) over the triangles; a quad is two. Positive where the faces face outwards.
 
@@ -192,7 +192,7 @@ def enclosed_volume(surface: RefinedSurface, *, part: SurfacePart) -> Float[Arra
     return volume / 6
 
 
-@_of_each
+@_vectorise
 def bending_energy(surface: RefinedSurface) -> Float[Array, ""]:
     """Energy of a thin plate, the integral of k_1^2 + k_2^2 = 4 H^2 - 2 K over the surface; 8 pi for a sphere.
 
@@ -202,7 +202,7 @@ def bending_energy(surface: RefinedSurface) -> Float[Array, ""]:
     return jnp.sum(surface.vertex_areas() * (4 * found.mean**2 - 2 * found.gaussian))
 
 
-@_of_each
+@_vectorise
 def inverted_faces(surface: RefinedSurface, *, margin: float = 0.05) -> Float[Array, ""]:
     """How far faces are turned over: the mean over their corners of max(0, margin - cos)^2.
 

@@ -176,7 +176,7 @@ def _records(path: Path, text: str, delimiter: str) -> Iterator[tuple[int, list[
         nonlocal inside
         for line in text.split("\n"):
             goes_on, inside = inside, True  # until the record ends, and the loop below says so
-            yield (line if goes_on else _without_comment(line, delimiter)) + "\n"
+            yield (line if goes_on else _cut_comment(line, delimiter)) + "\n"
 
     # Most files have neither comments nor quotes, and go through the parser as they are, which is twice as fast.
     plain = not any(mark in text for mark in ('"', "#", "//", *(";" if delimiter != ";" else ("\n;", "; "))))
@@ -197,7 +197,7 @@ def _records(path: Path, text: str, delimiter: str) -> Iterator[tuple[int, list[
         ) from None
 
 
-def _without_comment(line: str, delimiter: str) -> str:
+def _cut_comment(line: str, delimiter: str) -> str:
     begin = line.lstrip()
     # With semicolons an empty first cell begins a line as such a comment does.
     if begin.startswith(_COMMENTS) or (begin[:1] == ";" and (delimiter != ";" or begin[1:2].isspace())):
@@ -226,7 +226,7 @@ def _find_delimiter(path: Path, text: str) -> str:
         if len({len(cells) for _, cells in body}) == 1 and _n_numbers(body[-1][1], delimiter) >= 3:
             return delimiter
     # None does: the one that stands in the first row shows best what is wrong with the others.
-    first = next((line for line in text.split("\n") if _without_comment(line, " ").strip()), "")
+    first = next((line for line in text.split("\n") if _cut_comment(line, " ").strip()), "")
     return next((delimiter for delimiter in _DELIMITERS if delimiter in first.strip()), " ")
 
 

@@ -4,6 +4,8 @@ import itertools
 import os
 from pathlib import Path
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy loads: threads of two workers wait for one another
+
 import jax
 import jaxtyping
 import pytest

@@ -22,7 +22,7 @@ def fitted() -> fitting.FitResult:
 
 
 def test_own_level_is_the_fit():
-    at = fitted().at_level()
+    at = fitted().refine_to()
     assert at.levels == 1
     np.testing.assert_array_equal(at.surface.vertices, fitted().surface.vertices)
     np.testing.assert_array_equal(at.deviations, fitted().uncertainty().surface)
@@ -30,7 +30,7 @@ def test_own_level_is_the_fit():
 
 @pytest.mark.parametrize("levels", [0, 2, 3])
 def test_levels_share_their_vertices_and_what_is_known_there(levels):
-    own, at = fitted().at_level(), fitted().at_level(levels)
+    own, at = fitted().refine_to(), fitted().refine_to(levels)
     n = min(len(own.surface.vertices), len(at.surface.vertices))
     assert len(at.deviations) == len(at.distances) == len(at.surface.vertices)
     assert at.surface.n_faces == 14 * 4**levels
@@ -42,7 +42,7 @@ def test_levels_share_their_vertices_and_what_is_known_there(levels):
 
 def test_deviations_are_those_of_the_whole_covariance():
     result, levels = fitted(), 2
-    at, fit = result.at_level(levels), result.fit
+    at, fit = result.refine_to(levels), result.fit
     model, layout = dataclasses.replace(fit.model, topology=at.topology, priors=()), fit.model.layout
     normals = jnp.asarray(at.surface.normals)
 
@@ -66,11 +66,11 @@ def corners_of(surface: js.RefinedSurface) -> np.ndarray:
 
 
 def test_very_fine_surfaces_have_their_deviations_from_a_coarser_one(monkeypatch):
-    exact, coarse = fitted().at_level(3), fitted().at_level(2)
+    exact, coarse = fitted().refine_to(3), fitted().refine_to(2)
     limit = len(coarse.surface.vertices) * len(fitted().posterior.equations.structure.elements.seeds)
     monkeypatch.setattr(at_level, "_MOST_DERIVATIVES", limit)
     monkeypatch.setattr(at_level, "_AT_ONCE", 100)
-    found = fitted().at_level(3).deviations
+    found = fitted().refine_to(3).deviations
     n = len(coarse.surface.vertices)
     np.testing.assert_allclose(found[:n], coarse.deviations, rtol=1e-3)
     off = np.abs(found / exact.deviations - 1)
@@ -80,7 +80,7 @@ def test_very_fine_surfaces_have_their_deviations_from_a_coarser_one(monkeypatch
 def test_distances_are_told_where_the_scan_is():
     result = fitted()
     part = np.asarray(result.points)[:, 0] > 0
-    at = result.on(fitting.Scan(np.asarray(problem().points)[part])).at_level(3)
+    at = result.compare_with(fitting.Scan(np.asarray(problem().points)[part])).refine_to(3)
     x = np.asarray(at.surface.vertices)[:, 0]
     assert np.isnan(at.distances[x < -10]).all() and np.isfinite(at.distances[x > 5]).all()
 
@@ -94,18 +94,18 @@ def test_other_schemes_have_levels_too(name):
     points = np.asarray(js.refine(scheme, topology, mesh.control()).vertices)
     result = fitting.fit(scheme, topology, mesh.control(), fitting.Scan(points), max_sweeps=2, throw=False)
     for levels in (1, 3):
-        at = result.at_level(levels)
+        at = result.refine_to(levels)
         assert len(at.deviations) == len(at.surface.vertices) and np.isfinite(at.deviations).all()
 
 
 def test_levels_that_a_surface_does_not_have():
     with pytest.raises(ValueError, match="`levels` must lie between 0 and 8; got 9"):
-        fitted().at_level(9)
+        fitted().refine_to(9)
     p = problem()
     each = p.fit(scheme=js.Interpolating([1.0]), max_sweeps=1)
-    assert len(each.at_level(1).surface.vertices) == len(each.surface.vertices)
+    assert len(each.refine_to(1).surface.vertices) == len(each.surface.vertices)
     with pytest.raises(ValueError, match="no other level than 1, that of the fit: it has an h for each level"):
-        each.at_level(2)
+        each.refine_to(2)
     vertices, faces = meshes.cube()
     cube, scheme = js.ControlMesh(vertices * 20.0, faces), js.CatmullClark()
     creases = js.Creases(edges=[(faces[0][0], faces[0][1])], sharpness=[2.0])
@@ -113,4 +113,4 @@ def test_levels_that_a_surface_does_not_have():
     points = np.asarray(js.refine(scheme, topology, cube.control()).vertices)
     creased = fitting.fit(scheme, topology, cube.control(), fitting.Scan(points), max_sweeps=1, throw=False)
     with pytest.raises(ValueError, match="no other level than 1, that of the fit: its control mesh has creases"):
-        creased.at_level(2)
+        creased.refine_to(2)

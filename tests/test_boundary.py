@@ -16,7 +16,7 @@ from fitting import BoundaryCurve, Free, Priors, Scan, ScanError, boundary_of
 from fitting.model import pairing
 from fitting.model.priors import Place, Start
 from fitting.model.priors.boundary import BoundaryPrior, pair_with_boundary
-from fitting.solve import elements, sweeps
+from fitting.solve import derivatives, sweeps
 
 N_POINTS = 400
 
@@ -193,7 +193,7 @@ def test_curve_along_a_part_leaves_the_rest_to_the_scan():
 
 def test_new_pairs_compile_nothing():
     fit(scan(-2.0), BoundaryCurve(square(-1.0, 21.0), 0.2))  # anew: programs may have been forgotten since the last
-    programs = elements.differentiate, sweeps.hold_priors, sweeps._retract, pairing.measure
+    programs = derivatives.differentiate, sweeps.hold_priors, sweeps._retract, pairing.measure
     before = [program._cached._cache_size() for program in programs]
     fit(scan(1.0), BoundaryCurve(square(-0.5, 20.5), 0.3))
     assert [program._cached._cache_size() for program in programs] == before

@@ -13,7 +13,7 @@ import scans
 
 import fitting
 import jaxsubdiv as js
-from fitting.run.buckets import size_class, sort_into_classes
+from fitting.run.buckets import find_size_class, sort_into_classes
 from fitting.run.pilot import is_its_own_start
 
 N_SUBJECTS, SIZES = 3, (600, 500, 550)
@@ -164,7 +164,7 @@ def test_a_cohort_that_was_stopped_goes_on(tmp_path):
 
 
 def test_scans_of_other_sizes_are_fitted_in_classes_of_their_own(monkeypatch):
-    assert [size_class(n) for n in (3, 1024, 1025, 1280, 1281)] == [1024, 1024, 1280, 1280, 1600]
+    assert [find_size_class(n) for n in (3, 1024, 1025, 1280, 1281)] == [1024, 1024, 1280, 1280, 1600]
     assert sort_into_classes([1500, 900, 1300, 5000]) == [(1600, [1, 0, 2]), (6102, [3])]  # few scans join a class
     assert [size for size, _ in sort_into_classes([900] * 8 + [1300])] == [1024, 1600]
     monkeypatch.setattr("fitting.run.buckets._FEW", 1)

@@ -243,7 +243,7 @@ def test_surface_is_written_as_finely_and_in_the_formats_that_are_asked_for(file
     files_of_it = ["glb", "vtp", "surf.gii", "shape.gii", "surf", "stl", "obj", "ply"]
     written = ", ".join(f"surface.{name}" for name in files_of_it)
     assert f"wrote    control.obj, {written}, report.json" in capsys.readouterr().out
-    at = fitting.load("out").at_level(2)
+    at = fitting.load("out").refine_to(2)
     surface = js.read_mesh("out/surface.ply")
     np.testing.assert_allclose(surface.vertices, at.surface.vertices, rtol=1e-9, atol=1e-9)
     n_triangles = len(surface.faces[3]) + 2 * len(surface.faces[4])

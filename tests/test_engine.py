@@ -150,7 +150,7 @@ def test_directions_to_points_much_nearer_than_the_noise_are_normals():
 def test_rows_of_a_fit_are_for_any_solver_of_least_squares():
     fit = problem().fit(problem().points + noise(), tolerance=0.01).fit  # at rest, as the others will be
     model = fit.model
-    held, of_offsets = fit.held(), Residual(model).about(fit.y)
+    held, of_offsets = fit.gather_held(), Residual(model).recentre(fit.y)
     solvers = {
         "Levenberg-Marquardt": optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9),
         "Gauss-Newton": optx.GaussNewton(rtol=1e-9, atol=1e-9, linear_solver=sparse_solver(model, fit.y, held)),
@@ -174,8 +174,8 @@ def test_rows_of_a_fit_are_for_any_solver_of_least_squares():
 def test_rows_for_other_solvers_do_not_depend_on_what_is_fixed():
     fixed = np.arange(12) % 3 == 0
     model, y = analysed(js.Interpolating(), problem().topology, problem().truth, free=Free(vertices=~fixed))
-    rows = eqx.filter_jit(Residual(model).about(y))
-    held, zero = problem().fit(max_sweeps=0).fit.held(), Residual(model).about(y).zero
+    rows = eqx.filter_jit(Residual(model).recentre(y))
+    held, zero = problem().fit(max_sweeps=0).fit.gather_held(), Residual(model).recentre(y).zero
     at_zero, moved, others = (
         rows(eqx.tree_at(lambda one: one.vertices, zero, zero.vertices.at[which].set(1.0)), held)["stretch"]
         for which in (fixed & ~fixed, fixed, ~fixed)

@@ -36,7 +36,7 @@ def member() -> np.ndarray:
 def half(turn: Rotation, noise: float = 0.05) -> tuple[fitting.Scan, np.ndarray]:
     """Points of the half of the member with x above 0, turned and shifted; and the whole member there."""
     mesh = js.ControlMesh(member(), family()[0].faces, check=False)
-    corners = mesh.vertices[np.asarray(mesh.triangulated().faces[3])]
+    corners = mesh.vertices[np.asarray(mesh.triangulate().faces[3])]
     rng = np.random.default_rng(0)
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     chosen = corners[rng.choice(len(corners), 3000, p=areas / areas.sum())]

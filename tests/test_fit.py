@@ -22,7 +22,7 @@ from fitting.__main__ import main as fitting_command
 from fitting.model.priors.bend import bend_asymmetry
 from fitting.model.residual import Model, Pairs
 from fitting.model.unknowns import Unknowns, Variables, tangents
-from fitting.solve.elements import differentiate
+from fitting.solve.derivatives import differentiate
 from fitting.solve.sparse_normal import SparseEquations
 
 LOOSE = Priors(bend=10.0, stretch=10.0, h=10.0)
@@ -163,7 +163,7 @@ def test_rows_have_finite_derivatives_at_a_perfect_fit():
     model, y = analysed(scheme, topology, control)
     pairs = two_points()._replace(points=jnp.array([(0.75, 1.0, 0.0), (3.0, 0.0, 0.0)]))
     held = hold_everything(model, y, pairs, np.zeros(2, int))
-    of_offsets = Residual(model).about(y)
+    of_offsets = Residual(model).recentre(y)
     by = jax.jacfwd(of_offsets)(of_offsets.zero, held)
     assert np.allclose(Residual(model).rows(y, held)["distance"], 0)
     assert all(np.isfinite(part).all() for part in jax.tree.leaves(by))

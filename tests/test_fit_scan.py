@@ -87,7 +87,7 @@ def test_fit_that_was_stopped_after_a_split_goes_on_there(tmp_path):
 def test_part_of_the_points_is_fitted_and_all_are_measured():
     mesh, scan = mesh_and_scan()
     how, told = {"levels": 1, "pose": None, "throw": False, "max_sweeps": 12}, []
-    part = fit_scan(scan.drawn(N_POINTS // 2), mesh, **how).result
+    part = fit_scan(scan.draw(N_POINTS // 2), mesh, **how).result
     found = fit_scan(scan, mesh, most_points=N_POINTS // 2, on_stage=told.append, **how).result
     assert told[-1] == f"measures all {N_POINTS:,} points" and part.scan.n_points == N_POINTS // 2
     np.testing.assert_array_equal(found.control.vertices, part.control.vertices)
@@ -99,10 +99,10 @@ def test_part_of_the_points_is_fitted_and_all_are_measured():
     assert np.median(found.uncertainty().control) < 0.85 * np.median(part.uncertainty().control)
     assert found.recipe.most_points == N_POINTS // 2
     assert fitting.Recipe.from_json(found.recipe.to_json()).most_points == N_POINTS // 2
-    again = found.on(part.scan)
+    again = found.compare_with(part.scan)
     np.testing.assert_allclose(again.distances, part.distances, atol=1e-12)
     np.testing.assert_allclose(again.uncertainty().surface, part.uncertainty().surface, rtol=1e-6)
-    assert scan.drawn(10**6) is scan and len(np.unique(scan.drawn(50).points, axis=0)) == 50
+    assert scan.draw(10**6) is scan and len(np.unique(scan.draw(50).points, axis=0)) == 50
 
 
 def test_splitting_stops_at_the_noise():
@@ -153,7 +153,7 @@ def test_landmarks_pull_the_fit_to_them():
 def test_every_scheme_is_fitted_by_the_same_call(scheme):
     _, scan = mesh_and_scan()
     mesh = problem().mesh
-    mesh = mesh.triangulated() if scheme.takes == (3,) else mesh
+    mesh = mesh.triangulate() if scheme.takes == (3,) else mesh
     if scheme.takes == (4,):
         mesh = js.ControlMesh(*cube())
     # The control mesh is that of another scheme, whose curvature this one need not have.

@@ -11,7 +11,7 @@ import fitting
 import jaxsubdiv as js
 from fitting.run.fit import sound_start
 from fitting.solve import sweeps
-from fitting.start.folds import Folds, unfolded_start
+from fitting.start.folds import Folds, unfold_start
 
 INSIDE = 2  # of the sheet's faces: a vertex with three neighbours stands in it
 
@@ -51,12 +51,12 @@ def folds(mesh: js.ControlMesh) -> Folds:
 @pytest.mark.parametrize("kind", ["triangle", "quad", "mixed"])
 def test_no_face_of_a_sound_mesh_is_upside_down(kind):
     mesh = js.ControlMesh(*sheet(kind))
-    assert not folds(mesh).turned_over(mesh.vertices).any()
+    assert not folds(mesh).find_turned_over(mesh.vertices).any()
 
 
 def test_vertex_beyond_the_triangle_of_its_neighbours_turns_one_face():
     mesh = with_three_neighbours()
-    turned = folds(mesh).turned_over(pushed_out(mesh))
+    turned = folds(mesh).find_turned_over(pushed_out(mesh))
     assert np.flatnonzero(turned).tolist() == [len(mesh.faces[3]) - 3]
     assert np.flatnonzero(folds(mesh).corners_of(turned)).tolist() == sorted(mesh.faces[3][-3])
 
@@ -65,21 +65,21 @@ def test_quad_of_a_strip_that_is_laid_in_a_z_is_found():
     x = np.array([0.0, 2.0, 1.0, 3.0])
     strip = np.concatenate([np.stack([x, np.full(4, y), 0.1 * np.arange(4)], axis=1) for y in (0, 2)])
     mesh = js.ControlMesh(strip, [(i, i + 1, i + 5, i + 4) for i in range(3)])
-    assert folds(mesh).turned_over(strip).tolist() == [False, True, False]
+    assert folds(mesh).find_turned_over(strip).tolist() == [False, True, False]
 
 
 def test_face_without_area_is_not_upside_down():
     mesh = js.ControlMesh(*sheet())
     vertices = mesh.vertices.copy()
     vertices[mesh.faces[3][20]] = vertices[mesh.faces[3][20][0]]
-    assert not folds(mesh).turned_over(vertices)[20]
+    assert not folds(mesh).find_turned_over(vertices)[20]
 
 
 def test_only_the_vertices_of_faces_upside_down_move_and_none_stays():
     mesh = with_three_neighbours()
     start = pushed_out(mesh)
-    found = folds(mesh).unfolded(start, np.ones(len(start), bool))
-    assert not folds(mesh).turned_over(found).any()
+    found = folds(mesh).unfold(start, np.ones(len(start), bool))
+    assert not folds(mesh).find_turned_over(found).any()
     moved = np.flatnonzero(np.any(found != start, axis=1))
     assert set(moved) <= set(mesh.faces[3][-3]) and len(start) - 1 in moved
 
@@ -87,10 +87,10 @@ def test_only_the_vertices_of_faces_upside_down_move_and_none_stays():
 def test_vertices_that_are_fixed_or_on_the_boundary_are_not_unfolded():
     mesh = with_three_neighbours()
     start = pushed_out(mesh)
-    np.testing.assert_array_equal(folds(mesh).unfolded(start, np.zeros(len(start), bool)), start)
+    np.testing.assert_array_equal(folds(mesh).unfold(start, np.zeros(len(start), bool)), start)
     corner = mesh.vertices.copy()
     corner[0] += 8 * np.sign(corner[20] - corner[0])  # over its face's far side
-    found = folds(mesh).unfolded(corner, np.ones(len(start), bool))
+    found = folds(mesh).unfold(corner, np.ones(len(start), bool))
     np.testing.assert_array_equal(found[0], corner[0])
 
 
@@ -116,7 +116,8 @@ def lens(rings: int = 4, spokes: int = 16) -> tuple[np.ndarray, list[tuple[int, 
 def test_rim_of_a_thin_part_is_no_fold_and_stays_beside_one():
     vertices, faces = lens()
     mesh = js.ControlMesh(vertices, faces)
-    assert folds(mesh)._folded(mesh.vertices, np).sum() == 16 and not folds(mesh).upside_down(mesh.vertices).any()
+    assert folds(mesh)._find_folded(mesh.vertices, np).sum() == 16
+    assert not folds(mesh).find_upside_down(mesh.vertices).any()
     a, b, c = faces[-1]  # at the rim, on the lower side
     new = len(vertices)
     middle = vertices[[a, b, c]].mean(axis=0)
@@ -124,10 +125,10 @@ def test_rim_of_a_thin_part_is_no_fold_and_stays_beside_one():
     mesh = js.ControlMesh(
         with_one, [face for face in faces if face != (a, b, c)] + [(a, b, new), (b, c, new), (c, a, new)]
     )
-    assert folds(mesh).upside_down(with_one).sum() == 1
-    found = folds(mesh).unfolded(with_one, np.ones(len(with_one), bool))
+    assert folds(mesh).find_upside_down(with_one).sum() == 1
+    found = folds(mesh).unfold(with_one, np.ones(len(with_one), bool))
     moved = np.flatnonzero(np.any(found != with_one, axis=1))
-    assert not folds(mesh).upside_down(found).any() and len(moved) <= 6
+    assert not folds(mesh).find_upside_down(found).any() and len(moved) <= 6
 
 
 def test_warning_says_what_could_not_be_mended():
@@ -135,7 +136,7 @@ def test_warning_says_what_could_not_be_mended():
     topology = js.build_topology(mesh, js.Interpolating(), 1)
     control = js.ControlMesh(pushed_out(mesh), mesh.faces).control()
     with pytest.warns(UserWarning, match=r"They stay, as their vertices are fixed"):
-        assert unfolded_start(topology, control, False) is control
+        assert unfold_start(topology, control, False) is control
     with pytest.raises(ValueError, match=r"`Free.vertices` has 5 rows for 43 control vertices"):
         sound_start(js.Interpolating(), topology, control, fitting.Free(vertices=np.ones(5, bool)))
 
@@ -144,7 +145,7 @@ def test_start_is_left_as_it_is_without_faces_upside_down(recwarn):
     mesh = with_three_neighbours()
     control = mesh.control()
     topology = js.build_topology(mesh, js.Interpolating(), 1)
-    assert unfolded_start(topology, control, True) is control and not recwarn.list
+    assert unfold_start(topology, control, True) is control and not recwarn.list
 
 
 @functools.cache
@@ -165,7 +166,7 @@ def test_fit_from_a_face_upside_down_warns_and_finds_the_surface():
     mesh = with_three_neighbours()
     with pytest.warns(UserWarning, match=rf"lie upside down .*: {len(mesh.faces[3]) - 3} \(1 of"):
         found = fit_from(pushed_out(mesh))
-    assert not folds(mesh).turned_over(np.asarray(found.control.vertices)).any()
+    assert not folds(mesh).find_turned_over(np.asarray(found.control.vertices)).any()
     assert found.distances.std() < 0.1 * float(np.abs(pushed_out(mesh) - mesh.vertices).max())
 
 
@@ -185,7 +186,7 @@ def test_cohort_starts_without_faces_upside_down_too():
         )
     assert sum("upside down" in str(warning.message) for warning in told) == 1
     for vertices in np.asarray(found.control.vertices):
-        assert not folds(mesh).turned_over(vertices).any()
+        assert not folds(mesh).find_turned_over(vertices).any()
 
 
 @pytest.mark.filterwarnings("ignore:faces of the control mesh that lie upside down")
@@ -196,7 +197,7 @@ def test_step_that_turns_faces_over_is_taken_again_and_shorter(monkeypatch):
 
     def watched(*arguments):
         found = retract(*arguments)
-        turned.append(int(folds(mesh).turned_over(np.asarray(found.control.vertices)).sum()))
+        turned.append(int(folds(mesh).find_turned_over(np.asarray(found.control.vertices)).sum()))
         return found
 
     monkeypatch.setattr(sweeps, "_retract", watched)

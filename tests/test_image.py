@@ -27,7 +27,7 @@ import jaxsubdiv as js
 from fitting.__main__ import main as fit_command
 from fitting.image.volume import mask_of
 from fitting.start.mesh_topology import MeshTopology, face_topology
-from jaxsubdiv.frames import in_frame
+from jaxsubdiv.frames import convert_frame
 
 SHAPE, SPACING = (9, 8, 7), np.array([0.5, 1.25, 3.0])
 TURN = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
@@ -60,7 +60,7 @@ def test_a_voxel_lies_where_itk_says(tmp_path, suffix, directions, packed):
 
     assert volume.frame == ("RAS" if suffix.startswith(".nii") else "LPS")
     (index,) = np.argwhere(volume.layers[0] == 3)
-    place = in_frame(volume.positions(index.astype(float)), volume.frame, "LPS")
+    place = convert_frame(volume.positions(index.astype(float)), volume.frame, "LPS")
     np.testing.assert_allclose(place, image.TransformIndexToPhysicalPoint(MARKED), atol=1e-4)  # NIfTI: single precision
     np.testing.assert_allclose(volume.indices(volume.positions(np.eye(3))), np.eye(3), atol=1e-9)
     assert fitting.choose_label(volume, None) == fitting.Label(3, "")
@@ -336,7 +336,7 @@ def test_slices_show_the_label_where_it_is_and_name_their_sides(frame):
                 "P": [0, -1, 0],
                 "I": [0, 0, -1],
             }
-            step = in_frame(np.array(towards[letter], float), "RAS", frame)
+            step = convert_frame(np.array(towards[letter], float), "RAS", frame)
             assert way * (one.to_pixels[:3, :3] @ step)[axis] > 0
         assert top in "SA" and left in "RAI"
 

@@ -972,7 +972,7 @@ def test_a_failing_vtk_writer_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "a.vtp"
     write_mesh(path, mesh_of("mixed", False))
     old = path.read_bytes()
-    monkeypatch.setattr(_io._vtk, "_watch", lambda act: (act() and 0, "ERROR: Ran out of disk space"))
+    monkeypatch.setattr(_io._vtk, "watch", lambda act: (act() and 0, "ERROR: Ran out of disk space"))
     with pytest.raises(OSError, match=r"a\.vtp: VTK could not write the file: ERROR: Ran out"):
         write_mesh(path, mesh_of("quads", False))
     assert path.read_bytes() == old

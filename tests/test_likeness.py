@@ -223,7 +223,7 @@ def test_cohort_fills_holes_as_a_fit_does():
 def test_cohort_is_as_like_as_it_is_told_to_be_whatever_its_pilot_found():
     tables = SCHEME, anatomy().topology, anatomy().template
     found = fitting.fit_cohort(*tables, [anatomy().scan], priors=Priors(likeness=0.0), pilot=fitted(None))
-    assert found.result(0).likeness == 0 and not np.any(found.result(0).fit.held().priors["bend"])
+    assert found.result(0).likeness == 0 and not np.any(found.result(0).fit.gather_held().priors["bend"])
 
 
 def test_cohort_expects_no_heights_of_which_its_pilot_knows_no_strength():
@@ -255,7 +255,7 @@ def test_split_mesh_is_expected_to_stay_as_it_is_where_there_are_no_points(monke
     result.save(tmp_path)
     again = fitting.load(tmp_path)
     np.testing.assert_allclose(again.uncertainty().surface, result.uncertainty().surface, rtol=1e-9)
-    assert again.likeness == result.likeness == np.mean(np.asarray(result.fit.held().priors["bend"]) != 0)
+    assert again.likeness == result.likeness == np.mean(np.asarray(result.fit.gather_held().priors["bend"]) != 0)
     assert first["priors"].likeness is None and "alike" not in first
     assert then["priors"].likeness == 1 and result.recipe.priors.likeness is None
     # Points that count lie on the parts of faces that are not to stay as they are, and those lie where the points do.

@@ -183,7 +183,7 @@ def test_shapes_of_faces(faces, words: str):
         ([(np.inf, 0, 0), *SQUARE[1:]], [(0, 1, 2)], r"vertices 0 have coordinates that are not finite"),
         (SQUARE, [(0, 1, 2), (0, 2, 4)], r"face 1 use vertex indices >= 4, but there are 4 vertices.*OBJ"),
         (SQUARE, [(0, 1, 2), (0, 2, -1)], r"face 1 use negative vertex indices\. Vertices are counted from zero"),
-        (SQUARE, [(0, 1, 1, 2), (0, 2, 3)], r"face 0 name a corner twice\..*`repaired\(\)`"),
+        (SQUARE, [(0, 1, 1, 2), (0, 2, 3)], r"face 0 name a corner twice\..*`repair\(\)`"),
         (SQUARE, [(0, 1, 2, 0)], r"face 0 name a corner twice"),
         ([*SQUARE, (0, 0, 1)], [(0, 1, 2), (1, 0, 3), (0, 1, 4)], r"edges \(0, 1\) have more than two faces.*0, 1, 2"),
         (SQUARE, [(0, 1, 2), (0, 3, 2)], r"faces at edges \(0, 2\) are oriented oppositely \(faces 0, 1\)"),

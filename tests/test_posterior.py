@@ -19,8 +19,8 @@ from fitting.model.residual import Pairs
 from fitting.report import refit as _refit
 from fitting.report.misfit import misfit_variances
 from fitting.solve import elements as _elements
+from fitting.solve.derivatives import differentiate
 from fitting.solve.elements import (
-    differentiate,
     find_elements,
     find_patches,
     forgets_some,
@@ -58,7 +58,7 @@ def mixed_rows(kind: str, levels: int):
             np.random.default_rng(len(row)).uniform(0.5, 2, len(row)) if name != "distance" else precisions[name]
         )
     held = held._replace(distance_precisions=precisions.pop("distance"), precisions=precisions)
-    of_offsets, split = Residual(model).about(y), model.layout.split
+    of_offsets, split = Residual(model).recentre(y), model.layout.split
 
     @jax.jit
     def in_full(vector):
@@ -124,7 +124,7 @@ def test_elements_that_are_too_small_are_noticed():
     model, y, held, _ = mixed_rows("default", 2)
     surface = model.refine(y)
     owner = js.control_faces_of(model.scheme, model.topology, surface, y.control)
-    patches, rows = find_patches(surface, owner, model.topology.n_control_faces), row_faces(model, held.priors)
+    patches, rows = find_patches(surface.faces, owner, model.topology.n_control_faces), row_faces(model, held.priors)
     for rings in (0, 1):
         elements = find_elements(model, rings)
         found = differentiate(model, y, held.priors, elements.seeds)

@@ -124,7 +124,7 @@ def test_regions_go_along_where_the_mesh_is_split():
 def test_another_scan_is_measured_within_its_regions():
     result, (points, words) = shell_fit(), shell_points()
     swapped = fitting.Scan(points[::3], regions=["outer" if word == "inner" else "inner" for word in words[::3]])
-    again = result.on(swapped)
+    again = result.compare_with(swapped)
     np.testing.assert_allclose(np.abs(again.distances), APART, atol=0.4)
     assert [round(one.rms) for one in again.report().regions] == [2, 2]
 
@@ -145,7 +145,7 @@ def test_saved_fits_keep_regions(tmp_path):
     for found, expected in zip(again.fit.scene.choice, result.fit.scene.choice, strict=True):
         np.testing.assert_array_equal(found, expected)
     assert again.report().regions == result.report().regions
-    np.testing.assert_allclose(again.on(again.scan).distances, result.distances, atol=1e-9)
+    np.testing.assert_allclose(again.compare_with(again.scan).distances, result.distances, atol=1e-9)
     arrays = dict(np.load(tmp_path / "fit.npz"))
     np.savez(tmp_path / "fit.npz", **(arrays | {"face_regions": arrays["face_regions"][1:]}))
     with pytest.raises(ValueError, match="'face_regions' has 159 rows for 160 control faces"):
@@ -306,7 +306,7 @@ def test_groups_follow_triangles_first(tmp_path):
     )
     mesh = js.read_mesh(path)
     assert mesh.regions.words() == ["right", "", "left", "left"]
-    assert mesh.triangulated().regions.words() == ["right", "", "left", "left", "left", "left"]
+    assert mesh.triangulate().regions.words() == ["right", "", "left", "left", "left", "left"]
     path.write_text("\n".join([*lines, "g", "f 1 2 6 5"]))
     assert js.read_mesh(path).regions is None
 
@@ -315,7 +315,7 @@ def test_a_repair_keeps_the_groups_of_faces():
     vertices, faces = meshes.grid(3, 2, "quad")
     words = [f"g{i % 2}" for i in range(len(faces))]
     mesh = js.ControlMesh(vertices, [(0, 0, 1, 1), *faces], regions=["lost", *words], check=False)
-    assert mesh.repaired().regions.words() == words
+    assert mesh.repair().regions.words() == words
 
 
 def test_names_that_obj_does_not_hold_are_refused(tmp_path):

@@ -1,4 +1,4 @@
-"""ControlMesh.repaired: sound meshes come back as they were, damaged ones sound, and everything done is said."""
+"""ControlMesh.repair: sound meshes come back as they were, damaged ones sound, and everything done is said."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def volume(mesh: ControlMesh) -> float:
 
 
 def repaired(vertices, faces, normals=None, merge_within: float | None = None) -> ControlMesh:
-    mesh = ControlMesh(vertices, faces, normals, check=False).repaired(merge_within)
+    mesh = ControlMesh(vertices, faces, normals, check=False).repair(merge_within)
     ControlMesh(mesh.vertices, mesh.faces, mesh.normals)  # checked anew
     return mesh
 
@@ -82,7 +82,7 @@ def test_sound_meshes_come_back_equal(mesh: Mesh, with_normals: bool):
     faces = [tuple(c + 2 * (c >= half) for c in f) for f in faces]
     normals = np.random.default_rng(0).normal(size=vertices.shape) if with_normals else None
     sound = ControlMesh(vertices, faces, normals)
-    again = sound.repaired()
+    again = sound.repair()
     assert again.repairs == ()
     assert_equal(again, sound)
 
@@ -95,7 +95,7 @@ def touching_solids() -> Mesh:
 def test_solids_that_touch_stay_apart():
     vertices, faces = touching_solids()
     mesh = ControlMesh(vertices, faces, np.random.default_rng(0).normal(size=vertices.shape))
-    again = mesh.repaired()
+    again = mesh.repair()
     assert again.repairs == ()
     assert_equal(again, mesh)
 
@@ -147,7 +147,7 @@ def test_damaged_meshes_come_back_sound(case):
     assert made.euler_number == euler_number
     assert volume(made) == pytest.approx(volume(sound))
     np.testing.assert_allclose(made.vertices, sound.vertices, atol=1e-8)  # the order of the vertices is kept
-    assert made.repaired().repairs == ()
+    assert made.repair().repairs == ()
 
 
 @settings(deadline=None, max_examples=60)
@@ -195,7 +195,7 @@ def test_nothing_is_merged_further_away():
 @pytest.mark.parametrize("within", [-1.0, np.nan, np.inf])
 def test_merging_needs_a_length(within: float):
     with pytest.raises(MeshError, match=r"`merge_within` must be a length, zero or more; got"):
-        ControlMesh(*cube()).repaired(within)
+        ControlMesh(*cube()).repair(within)
 
 
 def test_merging_exact_copies_only():
@@ -275,7 +275,7 @@ def test_a_fin_is_cut_off():
         np.testing.assert_array_equal(made.faces[3][[0, 1, 3]], [(0, 2, 1), (1, 3, 0), (0, 6, 5)])
         assert set(made.faces[3][2]) == {4, 7, 8}
         np.testing.assert_array_equal(made.vertices[made.faces[3][2]], np.array(vertices)[list(fin)])
-        assert made.repaired().repairs == ()
+        assert made.repair().repairs == ()
 
 
 def test_a_book_of_pages():
@@ -286,7 +286,7 @@ def test_a_book_of_pages():
     made = repaired([(0, 0, 0), (0, 0, 1), *outer], faces)
     assert made.euler_number == 5
     assert made.n_faces == 5
-    assert made.repaired().repairs == ()
+    assert made.repair().repairs == ()
 
 
 @pytest.mark.parametrize("flip", [0, 1, 2])
@@ -303,7 +303,7 @@ def test_solids_joined_along_an_edge_come_apart(flip: int):
     assert made.euler_number == 4
     assert volume(made) == pytest.approx(16)
     assert any("Split the surface at 1 edge with more than two faces: copied 2" in note for note in made.repairs)
-    assert made.repaired().repairs == ()
+    assert made.repair().repairs == ()
 
 
 def test_a_pinched_ring_is_a_ring_again():
@@ -459,11 +459,11 @@ def test_what_was_repaired_needs_no_repair():
     changed = 0
     for seed in range(200):
         try:
-            made = random_mesh(seed).repaired()
+            made = random_mesh(seed).repair()
         except MeshError:  # nothing is left, or it has one side only
             continue
         made.check()
-        again = made.repaired()
+        again = made.repair()
         changed += bool(made.repairs)
         assert again.repairs == (), seed
         np.testing.assert_array_equal(again.vertices, made.vertices)

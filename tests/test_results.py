@@ -14,10 +14,10 @@ from scans import noise, problem
 import fitting
 import jaxsubdiv as js
 from fitting.__main__ import main
-from fitting.run.folder import RESULTS, filling, working_in
+from fitting.run.folder import RESULTS, fill_folder, reserve_folder
 from fitting.run.names import find_scans, name_folder, name_folders
 from jaxsubdiv.__main__ import main as refine
-from jaxsubdiv.console import lasting_streams, printable
+from jaxsubdiv.console import make_printable, survive_closed_streams
 
 pytestmark = pytest.mark.usefixtures("command_settings")
 
@@ -149,7 +149,7 @@ def test_odd_names_work_everywhere_and_none_leaves_the_output(here):
     for folder in folders:
         assert names(f"sub/out/{folder}") == sorted(RESULTS)
     titles = [row["scan"] for row in rows("sub/out/summary.csv")]
-    assert sorted(titles) == sorted(map(printable, ODD)) and "caf\\xe9.xyz" in titles
+    assert sorted(titles) == sorted(map(make_printable, ODD)) and "caf\\xe9.xyz" in titles
     assert "caf\\xe9.xyz" in Path("sub/out/caf\udce9/fit.html").read_text(encoding="utf-8")
 
 
@@ -186,11 +186,11 @@ def test_fit_that_cannot_be_written_leaves_the_one_before_and_goes_on_from_its_l
 def test_files_are_put_in_place_together_with_the_mark_to_the_end(here):
     Path("out").mkdir()
     Path("out/checkpoint_start.npz").touch()
-    with pytest.raises(ZeroDivisionError), filling(Path("out")) as new:
+    with pytest.raises(ZeroDivisionError), fill_folder(Path("out")) as new:
         (new / "control.obj").touch()
         raise ZeroDivisionError
     assert names("out") == ["checkpoint_start.npz"]
-    with filling(Path("out")) as new:
+    with fill_folder(Path("out")) as new:
         (new / "control.obj").touch()
         assert "control.obj" not in names("out")
     assert names("out") == ["control.obj"]
@@ -200,14 +200,14 @@ def test_what_killed_runs_left_goes_and_what_is_somebody_elses_stays(here):
     for left in (".unfinished-killed/fit.npz", ".unfinished-mine/letter.txt", ".unfinished-file", "checkpoint.npz"):
         Path("out", left).parent.mkdir(parents=True, exist_ok=True)
         Path("out", left).touch()
-    with working_in(Path("out")):
+    with reserve_folder(Path("out")):
         pass
     assert names("out") == [".unfinished-file", ".unfinished-mine"]
 
 
 def test_two_runs_do_not_work_in_one_folder(here, capsys):
     pytest.importorskip("fcntl")
-    with working_in(Path("out")):
+    with reserve_folder(Path("out")):
         assert run("scan.xyz", *QUICK, "-o", "out") == 2
     assert "another run is working in out" in capsys.readouterr().err
     assert run("scan.xyz", *QUICK, "-o", "out") == 1
@@ -346,7 +346,7 @@ def test_refinement_says_names_in_letters_that_the_terminal_has(here, monkeypatc
 def test_letters_that_a_terminal_lacks_are_escaped(monkeypatch):
     raw = io.BytesIO()
     monkeypatch.setattr("sys.stdout", io.TextIOWrapper(raw, encoding="ascii"))
-    with lasting_streams():
+    with survive_closed_streams():
         print("caf\u00e9 \udce9")
     assert raw.getvalue() == b"caf\\xe9 \\udce9\n"
 

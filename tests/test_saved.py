@@ -210,7 +210,7 @@ def test_fit_of_version_3_comes_back(name):
     np.testing.assert_allclose(found.uncertainty().surface, expected["spread"], rtol=1e-6)
     np.testing.assert_allclose(found.uncertainty().control, expected["control_spread"], rtol=1e-6)
     # Measured anew the scan lies as far off as it did.
-    np.testing.assert_allclose(found.on(found.scan).distances, found.distances, atol=1e-9)
+    np.testing.assert_allclose(found.compare_with(found.scan).distances, found.distances, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["whole", "slices"])

@@ -315,7 +315,7 @@ def test_faces_that_a_scheme_does_not_take_are_an_error(scheme, mesh, words):
 
 
 def test_triangulated_meshes_are_taken():
-    mesh = js.ControlMesh(*meshes.pyramid(), normals=np.eye(5, 3) + 1).triangulated()
+    mesh = js.ControlMesh(*meshes.pyramid(), normals=np.eye(5, 3) + 1).triangulate()
     assert mesh.faces[3].tolist()[-2:] == [[3, 2, 1], [3, 1, 0]] and len(mesh.faces[4]) == 0
     assert mesh.is_closed and mesh.normals is not None
     assert js.build_topology(mesh, js.Loop(), 1).faces[3].shape == (24, 3)

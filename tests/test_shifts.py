@@ -150,7 +150,7 @@ def test_uncertainty_knows_that_the_shifts_are_unknown():
     n = layout.columns("shifts").start
     names = [name for name, of in layout.shared for _ in range(int(np.prod(of.shape, dtype=int)))]
     others = ~np.isin(names, ["shifts", "motion"])  # a motion of the whole goes with the shifts
-    with_known = equations.factorise(equations.data.plus(equations.prior), fit.loose, others)
+    with_known = equations.factorise(equations.data.add(equations.prior), fit.loose, others)
     free, known = (of.solve(np.eye(layout.n))[:n, :n] for of in (posterior.factor, with_known))
     assert np.linalg.eigvalsh(free - known).min() > -1e-9
     # As a whole the surface is where the mean of the slices is, to PLANTED or so over their root.
@@ -259,7 +259,7 @@ def test_slices_of_another_scan_have_the_shifts_of_their_numbers():
     scan, result = displaced(), shifted()
     some = np.isin(np.arange(N_POINTS) // 60, [1, 4, 5])
     number = np.where(scan.slices[some] == 12, 100, scan.slices[some])  # which the fit did not see
-    part = result.on(Scan(scan.points[some], slices=number))
+    part = result.compare_with(Scan(scan.points[some], slices=number))
     by = np.where((number == 100)[:, None], 0.0, result.shifts[scan.slices[some] // 3])
     np.testing.assert_allclose(part.points - scan.points[some], by, atol=1e-12)
     np.testing.assert_allclose(part.distances[number < 100], result.distances[some][number < 100], atol=1e-12)

@@ -12,7 +12,7 @@ from schemes import control_mesh
 
 import fitting
 import jaxsubdiv as js
-from jaxsubdiv._scheme.seams import _FADE, along_normals
+from jaxsubdiv._scheme.seams import _FADE, project_on_normals
 
 CUBE = js.ControlMesh(*meshes.cube())
 SCHEMES = {
@@ -197,8 +197,8 @@ def test_one_missing_normal_leaves_that_of_the_other_side():
     d, n, zero = jnp.array([[1.0, 2.0, 3.0]]), jnp.array([[0.6, 0.8, 0.0]]), jnp.zeros((1, 3))
     expected = np.sum(d * n) * n
     for left, right in ((n, n), (n, zero), (zero, n), (n, -n)):
-        np.testing.assert_allclose(along_normals(d, left, right), expected, rtol=0, atol=1e-15)
-    assert not along_normals(d, zero, zero).any()
+        np.testing.assert_allclose(project_on_normals(d, left, right), expected, rtol=0, atol=1e-15)
+    assert not project_on_normals(d, zero, zero).any()
 
 
 # -------------------------------------------------------------------------------------------------------- derivatives
@@ -236,7 +236,7 @@ def test_fading_has_a_continuous_derivative(turned):
     d, n = jnp.array([[0.3, 1.0, -0.4]]), jnp.array([[0.0, 0.0, 1.0]])
 
     def rule(angle):
-        return along_normals(d, n, jnp.stack([jnp.sin(angle), 0 * angle, jnp.cos(angle)])[None])
+        return project_on_normals(d, n, jnp.stack([jnp.sin(angle), 0 * angle, jnp.cos(angle)])[None])
 
     angle = turned * 2 * np.arcsin(_FADE / 2)
     _, slope = jax.jvp(rule, (jnp.asarray(angle),), (jnp.asarray(1.0),))

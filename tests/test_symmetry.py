@@ -50,8 +50,8 @@ def test_mirror_plane_is_found_in_any_pose(mesh, n_on_plane, seed):
     own = np.arange(len(mesh.vertices))
     np.testing.assert_array_equal(found.partner[found.partner], own)
     assert (found.partner != own).any()  # in the plane of a flat mesh it is its own image
-    np.testing.assert_allclose(found.plane.mirrored(mesh.vertices), mesh.vertices[found.partner], atol=1e-9)
-    np.testing.assert_allclose(found.mirrored(mesh.vertices), mesh.vertices, atol=1e-9)
+    np.testing.assert_allclose(found.plane.mirror(mesh.vertices), mesh.vertices[found.partner], atol=1e-9)
+    np.testing.assert_allclose(found.mirror(mesh.vertices), mesh.vertices, atol=1e-9)
     assert n_on_plane is None or (found.partner == own).sum() == n_on_plane
 
 
@@ -76,7 +76,7 @@ def test_tolerance_is_how_far_a_vertex_may_be_off():
         find_symmetry(js.ControlMesh(vertices, faces), tolerance=0.01)
     found = find_symmetry(js.ControlMesh(vertices, faces))
     np.testing.assert_array_equal(found.partner, find_symmetry(js.ControlMesh(*one_sided())).partner)
-    asymmetry = np.linalg.norm(found.mirrored(vertices) - vertices, axis=1)
+    asymmetry = np.linalg.norm(found.mirror(vertices) - vertices, axis=1)
     assert 1.0 < asymmetry.max() < 1.5
 
 
@@ -92,7 +92,7 @@ def test_rows_and_their_derivatives_by_the_plane(free):
     model, y = analysed(js.Interpolating(), p.topology, control, **options)
     prior, place = model.prior("symmetry"), model.place(y)
     held, pairs = prior.hold(place, {}), np.arange(12) < find_symmetry(p.mesh).partner
-    departure = np.asarray(control.vertices) - find_symmetry(p.mesh).mirrored(control.vertices)
+    departure = np.asarray(control.vertices) - find_symmetry(p.mesh).mirror(control.vertices)
     rows = np.asarray(prior.rows(place, held))
     n = 3 * pairs.sum()
     np.testing.assert_allclose(rows[:n].reshape(-1, 3), departure[pairs], atol=1e-12)
@@ -105,11 +105,11 @@ def test_rows_and_their_derivatives_by_the_plane(free):
         """Of a mirror that is shifted along its normal, and turned."""
         turned = held.plane.normal + (change[1:] / held.extent) @ held.turns
         plane = Plane(held.plane.middle + change[0] * held.plane.normal, turned / jnp.linalg.norm(turned))
-        off, leaning = (control.vertices - plane.mirrored(control.vertices)[prior.partner]), []
+        off, leaning = (control.vertices - plane.mirror(control.vertices)[prior.partner]), []
         found = [off[prior.left].reshape(-1), (control.vertices[prior.on_plane] - plane.middle[None]) @ plane.normal]
         if np.any(free.normals):
             across = Plane(jnp.zeros(3), plane.normal)
-            leaning = control.normals - across.mirrored(control.normals)[prior.partner]
+            leaning = control.normals - across.mirror(control.normals)[prior.partner]
             found += [held.lever * leaning[prior.left].reshape(-1)]
             found += [held.lever * control.normals[prior.on_plane] @ plane.normal]
         return jnp.concatenate(found)
@@ -164,7 +164,7 @@ def test_deviation_is_how_far_the_fit_departs_from_symmetry():
     asymmetry = []
     for deviation in (np.inf, 0.1, 0.01):
         vertices = fitted(deviation).control.vertices
-        asymmetry.append(float(np.abs(partners.mirrored(vertices) - vertices).max()))
+        asymmetry.append(float(np.abs(partners.mirror(vertices) - vertices).max()))
     assert asymmetry[0] > 3 * asymmetry[1] > 9 * asymmetry[2] and asymmetry[2] < 0.01
 
 
@@ -178,7 +178,7 @@ def test_normals_are_tied_too():
 
 def _plane(found: fitting.FitResult) -> Plane:
     """The plane of a fit."""
-    return Plane(*map(np.asarray, found.fit.held().priors["symmetry"].plane))
+    return Plane(*map(np.asarray, found.fit.gather_held().priors["symmetry"].plane))
 
 
 def test_plane_moves_along_with_the_mesh(monkeypatch):
@@ -205,7 +205,7 @@ def test_uncertainty_falls_where_symmetry_tells():
     fit, equations = fitted(0.01).fit, fitted(0.01).posterior.equations
     layout, partner = fit.model.layout, find_symmetry(problem().mesh).partner
     names = [name for name, of in layout.shared for _ in range(int(np.prod(of.shape, dtype=int)))]
-    about_plane = equations.factorise(equations.data.plus(equations.prior), fit.loose, np.array(names) != "mirror")
+    about_plane = equations.factorise(equations.data.add(equations.prior), fit.loose, np.array(names) != "mirror")
     covariance = about_plane.solve(np.eye(layout.n))[: layout.n_own, : layout.n_own]
     blocks = covariance.reshape(12, layout.width, 12, layout.width)[np.arange(12), :3, np.arange(12), :3]
     variance = np.einsum("vi,vij,vj->v", fit.y.control.normals, blocks, fit.y.control.normals)
@@ -223,7 +223,7 @@ def test_refit_keeps_what_the_prior_says():
     _, moved = found.refit()(jnp.asarray(points))
     change = np.asarray(moved.vertices - again.vertices)
     assert np.abs(change).max() > 0.25
-    apart = partners.mirrored(moved.vertices) - np.asarray(moved.vertices)
+    apart = partners.mirror(moved.vertices) - np.asarray(moved.vertices)
     assert np.abs(apart).max() < 0.08
 
 
@@ -276,7 +276,7 @@ def test_start_that_is_not_symmetric_needs_partners():
     with pytest.raises(ValueError, match="no mirror plane"):
         p.fit(priors=STRICT, control=control)
     found = p.fit(priors=STRICT, control=control, symmetry=find_symmetry(p.mesh))
-    assert np.abs(find_symmetry(p.mesh).mirrored(found.control.vertices) - found.control.vertices).max() < 0.05
+    assert np.abs(find_symmetry(p.mesh).mirror(found.control.vertices) - found.control.vertices).max() < 0.05
 
 
 def test_fit_scan_takes_the_partners_from_the_template_and_its_split(monkeypatch):
@@ -294,5 +294,5 @@ def test_fit_scan_takes_the_partners_from_the_template_and_its_split(monkeypatch
     assert found.splits == 1 and [len(symmetry.partner) for symmetry, _ in seen] == [12, len(found.start.vertices)]
     assert [n for _, n in seen] == [12, len(found.start.vertices)]
     np.testing.assert_array_equal(seen[1][0].partner[:12], seen[0][0].partner)
-    asymmetry = np.abs(seen[1][0].mirrored(found.start.vertices) - found.start.vertices).max()
+    asymmetry = np.abs(seen[1][0].mirror(found.start.vertices) - found.start.vertices).max()
     assert 1e-3 < asymmetry < 0.5

@@ -10,7 +10,7 @@ from ..report.animation import animate_series
 from ..report.series import SeriesFit, load_series
 from ..report.series_page import write_series_page
 from ..run.checkpoint import marks_of
-from ..run.folder import ANIMATION, FRAMES, PAGE_OF_SERIES, TABLE_OF_SERIES, filling, working_in
+from ..run.folder import ANIMATION, FRAMES, PAGE_OF_SERIES, TABLE_OF_SERIES, fill_folder, reserve_folder
 from ..run.names import name_folders
 from ..run.recipe import Recipe
 from ..run.series import fit_series
@@ -21,6 +21,7 @@ from .progress import Progress
 
 # Options that a series has no use for, and their values where they are not given.
 _UNUSED = {"tolerance": None, "points": None, "boundary": None, "landmarks": None, "carry": None, "mirror": False}
+_UNUSED |= {"surface_tolerance": None, "tetrahedra": None, "patches": None}
 _UNUSED |= {"symmetry": None, "prior": None, "template_out": None}
 
 
@@ -31,7 +32,7 @@ def fit_frames(scans: list[Source], options: argparse.Namespace, recipe: Recipe)
         for name, usual in _UNUSED.items():
             if getattr(options, name) != usual:
                 raise ValueError(f"--{name.replace('_', '-')} is not of a series: leave it out.")
-        with working_in(folder):
+        with reserve_folder(folder):
             return _fit_and_save(scans, folder, options, recipe)
     except REFUSALS as error:
         return report_failure(error)
@@ -83,7 +84,7 @@ def _fit_and_save(scans: list[Source], folder: Path, options: argparse.Namespace
 
 def _save(folder: Path, found: SeriesFit, marks: dict[str, str]) -> None:
     """The series and its frames as files, all of them in place of those of an earlier one, or none."""
-    with filling(folder) as new:
+    with fill_folder(folder) as new:
         (new / FRAMES).mkdir()
         for number, name in enumerate(found.names):
             js.write_mesh(new / FRAMES / f"{name}.obj", found.control_mesh(number), frame=found.result.scan.frame)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 import jaxsubdiv as js
-from jaxsubdiv.frames import Frame, in_frame
+from jaxsubdiv.frames import Frame, convert_frame
 
 from ..image.boundary import suggest_settings
 from ..image.read import Seen, is_image, read_labels, read_scan, read_seen, stem
@@ -138,8 +138,8 @@ def _read_template(
     if of_scan is None or own == of_scan:
         return mesh, own
     print(f"note     the control mesh was turned from {own}, as its file says, to the scan's {of_scan}")
-    normals = None if mesh.normals is None else in_frame(mesh.normals, own, of_scan)
-    turned = in_frame(mesh.vertices, own, of_scan)
+    normals = None if mesh.normals is None else convert_frame(mesh.normals, own, of_scan)
+    turned = convert_frame(mesh.vertices, own, of_scan)
     return js.ControlMesh(turned, mesh.faces, normals, regions=mesh.regions), of_scan
 
 
@@ -170,4 +170,6 @@ def mark_job(job: Job, recipe: Recipe, options: argparse.Namespace) -> dict[str,
     inputs |= {} if job.carried is None else {"carried landmarks": job.carried}
     if (options.surface, options.surface_level) != (["ply"], None):
         inputs["surface format or level"] = options.surface, options.surface_level
+    for name in ("surface_tolerance", "tetrahedra", "patches"):
+        inputs |= {} if getattr(options, name) is None else {name.replace("_", " "): getattr(options, name)}
     return marks_of(inputs | {field.name: getattr(recipe, field.name) for field in dataclasses.fields(recipe)})

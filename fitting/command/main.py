@@ -4,23 +4,24 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from jaxsubdiv.console import lasting_streams, plain_warnings
+from jaxsubdiv.console import simplify_warnings, survive_closed_streams
 
 from ..run.names import name_folder
 from ..run.surface_files import check_formats
+from .exports import check_exports
 from .frames import fit_frames
 from .inputs import find_sources
 from .many import fit_all
 from .messages import report_failure
 from .one import fit_one
 from .options import check_options, make_parser, make_recipe
-from .programs import keep_compiled_programs
+from .programs import calculate_in_one_thread, keep_compiled_programs
 from .template import make_template_of_all
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line: exit status 0, 1 for a fit not to be trusted, 2 for an input of no use, 130 where stopped."""
-    with lasting_streams(), plain_warnings():
+    with survive_closed_streams(), simplify_warnings():
         return _main(arguments)
 
 
@@ -41,10 +42,12 @@ def _main(arguments: Sequence[str] | None) -> int:
     if options.template_out and (options.control or options.prior or not options.scans):
         parser.error("--template-out makes a template of scans: give scans, and neither --control nor --prior")
     keep_compiled_programs()
+    calculate_in_one_thread()
     try:
         check_options(options)
         scans, recipe = find_sources(options), make_recipe(options)
         check_formats(options.surface)
+        check_exports(options)
     except (ValueError, OSError, ImportError) as error:
         return report_failure(error)
     try:

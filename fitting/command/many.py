@@ -8,9 +8,9 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from jaxsubdiv.files import replacing
+from jaxsubdiv.files import replace_file
 
-from ..run.folder import CARRIED, SUMMARY, working_in
+from ..run.folder import CARRIED, SUMMARY, reserve_folder
 from ..run.names import name_folders
 from ..run.recipe import Recipe
 from .inputs import Source
@@ -39,7 +39,7 @@ def fit_all(scans: list[Source], options: argparse.Namespace, recipe: Recipe) ->
     folders = name_folders([scan.as_file for scan in scans])
     rows, summary, landmarks = [], "", []
     try:
-        with working_in(parent):
+        with reserve_folder(parent):
             for number, (scan, title, name) in enumerate(zip(scans, titles, folders, strict=True), 1):
                 print(f"\n[{number}/{len(scans)}] {scan.title(whole=True)}")
                 rows.append(fit_one(scan, parent / name, options, recipe, title))
@@ -75,7 +75,7 @@ def _read_landmark_rows(path: Path, title: str) -> list[dict]:
 def _write_table(path: Path, text: str) -> None:
     """Tell where that fails, and go on: the fits of the next scans do not depend on it."""
     try:
-        with replacing(path) as unfinished:
+        with replace_file(path) as unfinished:
             unfinished.write_text(text, encoding="utf-8")
     except OSError as error:
         report_failure(error)

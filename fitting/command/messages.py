@@ -5,7 +5,7 @@ import sys
 import numpy as np
 
 import jaxsubdiv as js
-from jaxsubdiv.console import in_colour
+from jaxsubdiv.console import colour
 
 from ..report.result import FitResult
 from ..run.fit_scan import ScanFit
@@ -32,7 +32,7 @@ def print_regions(scan: Scan, mesh: js.ControlMesh, groups: Groups | None) -> No
 
 def print_warnings(result: FitResult) -> None:
     for finding in result.warnings:
-        print(in_colour(f"WARNING  {finding.text}"))
+        print(colour(f"WARNING  {finding.text}"))
 
 
 def describe_ending(found: ScanFit, off: float) -> str:

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 import jaxsubdiv as js
-from jaxsubdiv.console import printable
+from jaxsubdiv.console import make_printable
 
 from ..report.result import FitResult
 from ..report.saved import read_marks
-from ..run.checkpoint import differing
+from ..run.checkpoint import find_differing
 from ..run.fit_scan import misfit
-from ..run.folder import FIT, is_unfinished, working_in
+from ..run.folder import FIT, is_unfinished, reserve_folder
 from ..run.recipe import Recipe, load
 from ..start.mesh_topology import topology_of
 from .inputs import Source, mark_job, read_inputs, suggest_for_image
@@ -29,9 +29,9 @@ REFUSALS = (js.MeshError, ValueError, TypeError, OSError, ImportError, RuntimeEr
 
 def fit_one(scan: Source | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str) -> dict:
     """One fit: its row of the summary, whose status is 0, 1 for one not to be trusted, 2 for one that failed."""
-    title, began = printable(title), time.perf_counter()
+    title, began = make_printable(title), time.perf_counter()
     try:
-        with working_in(folder):
+        with reserve_folder(folder):
             return _fit_and_save(scan, folder, options, recipe, title)
     except REFUSALS as error:
         status = report_failure(error)
@@ -90,7 +90,7 @@ def is_done(folder: Path, marks: dict[str, str]) -> bool:
     if is_unfinished(folder) or not (folder / FIT).exists():
         return False
     then = read_marks(folder)
-    others = f"with another {', another '.join(differing(then, marks))}" if then else "that does not say of what"
+    others = f"with another {', another '.join(find_differing(then, marks))}" if then else "that does not say of what"
     if then != marks:
         raise ValueError(
             f"{folder} holds a fit {others}. Without --resume it is fitted anew and replaced; or give another folder "

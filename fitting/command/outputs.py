@@ -16,9 +16,10 @@ from ..report.result import FitResult
 from ..report.saved import save_fit
 from ..run.carry import carry_landmarks
 from ..run.fit_scan import ScanFit
-from ..run.folder import CARRIED, LANDMARKS, filling
+from ..run.folder import CARRIED, LANDMARKS, fill_folder
 from ..run.surface_files import write_surface
 from ..scan.landmarks import write_landmarks
+from .exports import find_level, write_exports
 from .inputs import Job
 
 
@@ -28,7 +29,7 @@ def save_outputs(
     """The fit as files, all of them in place of those of an earlier one, or none."""
     result, frame = found.result, job.scan.frame or (job.carried.frame if job.carried is not None else None)
     slices = cut_job_slices(job, result)
-    with filling(folder) as new:
+    with fill_folder(folder) as new:
         js.write_mesh(new / "control.obj", result.control_mesh, frame=frame)
         written = ["control.obj", *_write_surface(new, result, options, frame)]
         written += ["report.json", "fit.html", "fit.npz", "recipe.json"]
@@ -52,7 +53,8 @@ def save_outputs(
 def _write_surface(folder: Path, result: FitResult, options: argparse.Namespace, frame: Frame | None) -> list[str]:
     """The surface's files; where it has no such level, told, none: the fit itself is not lost."""
     try:
-        return write_surface(folder, result.at_level(options.surface_level), options.surface, frame)
+        at = result.refine_to(find_level(result, options))
+        return write_surface(folder, at, options.surface, frame) + write_exports(folder, result, at, options)
     except (ValueError, MemoryError) as error:
         print(f"note     no surface: {str(error) or 'it takes more memory than there is'}")
         return []

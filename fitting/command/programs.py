@@ -1,4 +1,4 @@
-"""Compiled programs and memory, kept from run to run."""
+"""Compiled programs and memory, kept from run to run, and threads."""
 
 import os
 from pathlib import Path
@@ -6,6 +6,8 @@ from pathlib import Path
 import jax
 
 import jaxsubdiv as js
+
+_THREADS = {"OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"}
 
 
 def keep_compiled_programs() -> None:
@@ -17,6 +19,17 @@ def keep_compiled_programs() -> None:
     # A fit compiles many small programs besides few large ones: they are kept too.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def calculate_in_one_thread() -> None:
+    """Have the libraries of numpy and scipy solve in one thread, unless the environment gives a number: the matrices of
+    a fit are small, and on busy cores their threads wait for one another, ten times as long as the work takes."""
+    if _THREADS.isdisjoint(os.environ):
+        try:
+            from threadpoolctl import threadpool_limits
+        except ImportError:
+            return
+        threadpool_limits(1, "blas")
 
 
 def _compile_quickly() -> None:

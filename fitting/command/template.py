@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 import jaxsubdiv as js
-from jaxsubdiv.console import in_colour
+from jaxsubdiv.console import colour
 
-from ..run.folder import working_in
+from ..run.folder import reserve_folder
 from ..run.names import name_folders
 from ..run.recipe import Recipe
 from ..run.template import make_template
@@ -30,7 +30,7 @@ def make_template_of_all(scans: list[Source], options: argparse.Namespace, recip
         for scan, name in zip(scans, names, strict=True):
             job = read_inputs(scan, options, recipe)
             print(f"scan     {name}: {job.scan.n_points:,} points, {describe_size(np.asarray(job.scan.points))}")
-            chosen.append(job.scan.drawn(recipe.most_points or _MOST_POINTS))
+            chosen.append(job.scan.draw(recipe.most_points or _MOST_POINTS))
         found = make_template(
             chosen,
             faces=recipe.faces,
@@ -47,16 +47,14 @@ def make_template_of_all(scans: list[Source], options: argparse.Namespace, recip
         js.write_mesh(options.template_out, found.mesh)
         print(f"wrote    {options.template_out}: {len(found.mesh.vertices):,} vertices, {found.mesh.n_faces:,} faces")
         if options.output:
-            with working_in(Path(options.output)):
+            with reserve_folder(Path(options.output)):
                 found.cohort.save(options.output)
             print(f"wrote    the fits to {options.output}, for --prior")
     except REFUSALS as error:
         return report_failure(error)
     doubted = [name for name, trusted in zip(found.cohort.names, found.cohort.trusted, strict=True) if not trusted]
     if doubted:
-        print(in_colour(f"WARNING  fits not to be trusted: {', '.join(doubted)}"))
+        print(colour(f"WARNING  fits not to be trusted: {', '.join(doubted)}"))
     if not found.at_rest:
-        print(
-            in_colour(f"WARNING  the last mean still moved by {found.moved[-1]:.3g} mm: it depends on the first scan")
-        )
+        print(colour(f"WARNING  the last mean still moved by {found.moved[-1]:.3g} mm: it depends on the first scan"))
     return 0 if found.at_rest and not doubted else 1

@@ -69,7 +69,7 @@ def scan_of_label(volume: Volume, label: Label, *, most_points: int = MOST_POINT
         raise ScanError(f"the label '{label}' fills the image: it has no boundary in it.")
     slope = _slope(inside.astype(np.float32), found.at, _widths(volume))
     outward = _normals(slope, volume)
-    _tell_thin(inside, found, outward, volume, str(label))
+    _warn_if_thin(inside, found, outward, volume, str(label))
     axis = found.axis
     across = np.einsum("px,px->p", outward, _axes(volume)[axis])
     deviations = volume.spacing[axis] * np.sqrt((across**2 + _TURNED**2) / 12)
@@ -243,7 +243,7 @@ def _noise(values: Float[np.ndarray, "i j k"]) -> float:
     return float(np.median(np.abs(second)) * 1.4826 / np.sqrt(6)) if len(second) else 0.0
 
 
-def _tell_thin(
+def _warn_if_thin(
     mask: Shaped[np.ndarray, "i j k"], found: _Crossings, outward: Float[np.ndarray, "p 3"], volume: Volume, label: str
 ) -> None:
     """Warn of parts that are hardly thicker than a voxel: their two walls cannot be told apart well."""

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxsubdiv.extras import import_extra
+
 from ..scan.scan import ScanError
-from .need import DEFLATED, check_room, need
+from .room import DEFLATED, check_room
 from .volume import Label, Volume
 
 
@@ -17,7 +19,7 @@ def read(path: Path) -> Volume:
 
     A voxel that has a segment by a probability has it from a half on.
     """
-    highdicom = need("highdicom")
+    highdicom = import_extra("highdicom", "images", "DICOM segmentations")
     data = path.read_bytes()  # from a file pydicom would ask for as many bytes as a damaged length says
     try:
         segmentation: Any = highdicom.seg.segread(BytesIO(data))
@@ -44,4 +46,4 @@ def read(path: Path) -> Volume:
         Label(n, name, min(at, len(layers) - 1)) for at, (n, name) in enumerate(zip(numbers, names, strict=True))
     )
     # Slices without any segment are not stored: past the last there is nothing, not the end of what was seen.
-    return Volume(layers, affine, "LPS", labels).padded((1, 0, 0), (1, 0, 0))
+    return Volume(layers, affine, "LPS", labels).pad((1, 0, 0), (1, 0, 0))

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..scan.scan import ScanError
-from .need import DEFLATED, check_room
+from .room import DEFLATED, check_room
 from .volume import Volume
 
 _MOST_HEADER = 1 << 16
@@ -37,7 +37,7 @@ def read(path: Path) -> Volume:
     if kind is None or fields.get("ElementNumberOfChannels", "1") != "1":
         raise ScanError(f"its voxels are of the type '{fields.get('ElementType', '')}'; one number each is read.")
     shape = _numbers(fields, "DimSize", 3).astype(int)
-    order = ">" if _true(fields, "BinaryDataByteOrderMSB") or _true(fields, "ElementByteOrderMSB") else "<"
+    order = ">" if _is_set(fields, "BinaryDataByteOrderMSB") or _is_set(fields, "ElementByteOrderMSB") else "<"
     dtype = np.dtype(order + kind)
     data = _read_voxels(path, fields, rest, math.prod(int(n) for n in shape) * dtype.itemsize)
     values = np.frombuffer(data, dtype).reshape(shape, order="F").astype(dtype.newbyteorder("="))
@@ -80,7 +80,7 @@ def _read_voxels(path: Path, fields: dict[str, str], start: int, n_bytes: int) -
         file, start = path.parent / where, 0
         if not os.path.isfile(file):  # also of a name that no file can have
             raise ScanError(f"its voxels are in '{where[:60]}', which is not beside it.")
-    packed = _true(fields, "CompressedData")
+    packed = _is_set(fields, "CompressedData")
     check_room(n_bytes, file.stat().st_size - start, DEFLATED if packed else 1)
     skipped = int(_numbers(fields, "HeaderSize", 1, "0")[0])
     with file.open("rb") as voxels:
@@ -96,7 +96,7 @@ def _read_voxels(path: Path, fields: dict[str, str], start: int, n_bytes: int) -
     return data[:n_bytes]
 
 
-def _true(fields: dict[str, str], name: str) -> bool:
+def _is_set(fields: dict[str, str], name: str) -> bool:
     return fields.get(name, "").lower() in ("true", "1")
 
 

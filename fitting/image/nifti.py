@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxsubdiv.extras import import_extra
+
 from ..scan.scan import ScanError
-from .need import DEFLATED, check_room, need
+from .room import DEFLATED, check_room
 from .volume import Label, Volume
 
 _UNITS = {1: 1000.0, 2: 1.0, 3: 0.001}  # of NIfTI: m, mm, micrometres
@@ -24,7 +26,7 @@ _NAMED, _KEY = re.compile(r"<Label\b([^<>]*)>(?:<!\[CDATA\[)?([^<\]]*)"), re.com
 
 def read(path: Path) -> Volume:
     """The volume; a fourth dimension must be of length 1."""
-    nibabel = need("nibabel")
+    nibabel = import_extra("nibabel", "images", "NIfTI files")
     kinds: Any = nibabel.nifti1.data_type_codes.dtype
     _check_header(
         path, {code: kinds[code].itemsize for code in kinds if isinstance(code, int) and kinds[code].kind in "iuf"}

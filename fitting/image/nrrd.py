@@ -10,10 +10,11 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from jaxsubdiv.extras import import_extra
 from jaxsubdiv.frames import Frame
 
 from ..scan.scan import ScanError
-from .need import BZIPPED, DEFLATED, check_room, need
+from .room import BZIPPED, DEFLATED, check_room
 from .volume import Label, Volume
 
 _MOST_HEADER = 1 << 22
@@ -44,7 +45,7 @@ _UNITS = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "um": 0.001, "µm": 0.001}
 
 def read(path: Path) -> Volume:
     """The volume, of as many layers as a segmentation of 3D Slicer has."""
-    nrrd = need("nrrd")
+    nrrd = import_extra("nrrd", "images", "NRRD files")
     lines, start = _read_header(path)
     try:
         header: Any = nrrd.read_header(lines)
@@ -154,7 +155,7 @@ def _place(values: np.ndarray, header: Any) -> Volume:
         return volume
     # 3D Slicer stores no more than the box of all segments: past it there is nothing, but where the image begins.
     first, second, third = (int(n > 0) for n in offset)
-    return volume.padded((first, second, third), (1, 1, 1))
+    return volume.pad((first, second, third), (1, 1, 1))
 
 
 def _vector(row: Any) -> np.ndarray | None:

@@ -86,15 +86,15 @@ def read_volume(path: str | os.PathLike[str], *, scale: float = 1.0) -> Volume:
         volume = _READERS[suffix](path)
         volume = volume._replace(
             layers=tuple(layer.astype(layer.dtype.newbyteorder("="), copy=False) for layer in volume.layers),
-            labels=tuple(label._replace(name=_plain(label.name)) for label in volume.labels),
-        ).scaled(scale)
+            labels=tuple(label._replace(name=_shorten_name(label.name)) for label in volume.labels),
+        ).rescale(scale)
         _check(volume)
     except ScanError as error:
         raise ScanError(f"{path.name}: {error}") from None
     return volume
 
 
-def _plain(name: str) -> str:
+def _shorten_name(name: str) -> str:
     """A name as it can be printed: on one line, and not longer than a line."""
     return "".join(c if c.isprintable() else " " for c in name).strip()[:100]
 

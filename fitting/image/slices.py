@@ -60,11 +60,11 @@ def cut_slices(
     high = np.clip(np.ceil(at.max(axis=0) + margin) + 1, low + 2, shape).astype(int)
     middle = np.clip(np.round((at.min(axis=0) + at.max(axis=0)) / 2), 0, shape - 1).astype(int)
     part = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    grey = _grey(volume, label, part)
+    grey = _make_grey(volume, label, part)
     return tuple(_slice(volume, grey, low, high, axis, int(middle[axis])) for axis in range(3))  # pyright: ignore
 
 
-def _grey(volume: Volume, label: Label | None, part: tuple[slice, ...]) -> Float[np.ndarray, "i j k"]:
+def _make_grey(volume: Volume, label: Label | None, part: tuple[slice, ...]) -> Float[np.ndarray, "i j k"]:
     if label is not None:
         here = volume._replace(layers=tuple(layer[part] for layer in volume.layers))
         others = np.any([layer != 0 for layer in here.layers], axis=0)

@@ -61,14 +61,14 @@ class Volume(NamedTuple):
         """Where positions in mm lie among the voxels."""
         return (points - self.affine[:3, 3]) @ np.linalg.inv(self.affine[:3, :3]).T
 
-    def padded(self, before: tuple[int, int, int], after: tuple[int, int, int]) -> "Volume":
+    def pad(self, before: tuple[int, int, int], after: tuple[int, int, int]) -> "Volume":
         """The same with so many voxels of background along each index before and after it."""
         affine = self.affine.copy()
         affine[:3, 3] = self.positions(-np.array(before, float))
         widths = tuple(zip(before, after, strict=True))
         return self._replace(layers=tuple(np.pad(layer, widths) for layer in self.layers), affine=affine)
 
-    def scaled(self, scale: float) -> "Volume":
+    def rescale(self, scale: float) -> "Volume":
         """The same with positions in another unit."""
         affine = self.affine.copy()
         affine[:3] *= scale
@@ -81,7 +81,7 @@ class Found(NamedTuple):
     label: Label
     voxels: int
 
-    def in_words(self, volume: Volume) -> str:
+    def describe(self, volume: Volume) -> str:
         """`3 tibia (12.5 ml)`."""
         return f"{self.label} ({self.voxels * volume.voxel_volume / 1000:.3g} ml)"
 
@@ -111,7 +111,7 @@ def choose_label(volume: Volume, wanted: str | int | None) -> Label:
         ScanError: there is no such label, or there are several; the text lists them with their volumes.
     """
     found = find_labels(volume)
-    there = ", ".join(one.in_words(volume) for one in found)
+    there = ", ".join(one.describe(volume) for one in found)
     if wanted is None:
         if len(found) > 1:
             raise ScanError(f"it has {len(found)} labels; choose one by --label (`label=`), or all: {there}.")

@@ -71,19 +71,19 @@ def compare_groups(
     total = np.sum(flat.reshape(n, v, 3) ** 2, axis=(0, 2))
     part = n_second * (n - n_second) / n  # of the squared difference of means: what lies between the groups
 
-    def between(rows: Float[np.ndarray, "b s"]) -> Float[np.ndarray, "b v"]:
+    def variance_between(rows: Float[np.ndarray, "b s"]) -> Float[np.ndarray, "b v"]:
         # The shapes sum to zero: the mean of the others follows from that of the second group.
         apart = rows @ flat * (1 / n_second + 1 / (n - n_second))
         return part * np.sum(apart.reshape(-1, v, 3) ** 2, axis=2)
 
-    own = between(second[None].astype(float))[0]
+    own = variance_between(second[None].astype(float))[0]
     scaled = np.maximum(total, np.finfo(float).tiny)
     own_max, own_all = own / scaled, own.sum()
     # Of random divisions, the given one is one more.
     n_seen = n_all = 0 if comb(n, n_second) <= n_permutations else 1
     at_least = np.full((2, v), float(n_all))
     for rows in _divisions(n, n_second, n_permutations, seed, max(1, _AT_ONCE // (3 * v))):
-        found = between(rows)
+        found = variance_between(rows)
         # Rounding differs from one product to the next: the same division must count as the same.
         at_least[0] += np.sum(found >= own * (1 - 1e-9), axis=0)
         at_least[1] += np.sum((found / scaled).max(axis=1)[:, None] >= own_max * (1 - 1e-9), axis=0)

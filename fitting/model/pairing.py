@@ -111,7 +111,7 @@ def make_scene(
     """
     of_points = None if planes is None else planes.rows_of(scan)
     open_vertices = boundary_vertices(surface)
-    return Scene(scan.without_slices(), surroundings(scan), find_strokes(scan), of_points, open_vertices, choice)
+    return Scene(scan.drop_slices(), surroundings(scan), find_strokes(scan), of_points, open_vertices, choice)
 
 
 def empty_look(scene: Scene) -> Look:
@@ -151,7 +151,7 @@ def measure(
     distance, spread = norm(away)[:, 0], scan.relative_deviations()
     given = jnp.where(around.scattered, 0.0, scan.relative_weights())
     corners, inside = corner_weights(surface, at)
-    at_boundary = on_boundary(open_vertices, corners, inside)
+    at_boundary = is_on_boundary(open_vertices, corners, inside)
     if scan.normals is not None:
         cosine = dot(unit(scan.normals), normals)[:, 0]
         # Files have normals of either side: the side that most points are on is outside.
@@ -172,7 +172,7 @@ def measure(
     across = jnp.abs(dot(normals, away))[:, 0]
     goes_on = around.crowded & (distance < edge) & (across < 3 * scale * spread + _STEEPEST * distance)
     if covered is not None:
-        goes_on &= ~on_boundary(covered, corners, inside)
+        goes_on &= ~is_on_boundary(covered, corners, inside)
     weights = jnp.where(at_boundary & ~goes_on, 0.0, weights)
     alike = jnp.ones((), points.dtype)
     if scene.strokes is not None:
@@ -196,7 +196,7 @@ def measure(
     )
 
 
-def on_boundary(
+def is_on_boundary(
     boundary: Bool[Array | np.ndarray, "v"],
     corners: Int[Array | np.ndarray, "p 4"],
     corner_weights: Float[Array | np.ndarray, "p 4"],

@@ -92,9 +92,9 @@ class Settings:
             value = getattr(self, field.name)
             if field.name in ("scheme", "loss"):
                 known = _SCHEMES if field.name == "scheme" else _LOSSES
-                value = {"name": _known_name(field.name, value, known)} | _to_plain(value)
+                value = {"name": _known_name(field.name, value, known)} | _encode_module(value)
             elif isinstance(value, eqx.Module):
-                value = _to_plain(value)
+                value = _encode_module(value)
             values[field.name] = value
         return json.dumps(values, indent=2, allow_nan=False)
 
@@ -119,25 +119,25 @@ class Settings:
         fields = {field.name for field in dataclasses.fields(cls)}
         _refuse_others("a recipe", values, fields)
         makers = {
-            "scheme": lambda value: _named("scheme", value, _SCHEMES),
-            "loss": lambda value: _named("loss", value, _LOSSES),
-            "free": lambda value: _from_plain("free", Free, value),
+            "scheme": lambda value: _decode_named("scheme", value, _SCHEMES),
+            "loss": lambda value: _decode_named("loss", value, _LOSSES),
+            "free": lambda value: _decode("free", Free, value),
             "priors": _priors,
-            "levels": lambda value: _checked("levels", value, int),
-            "max_sweeps": lambda value: _checked("max_sweeps", value, int),
+            "levels": lambda value: _check_type("levels", value, int),
+            "max_sweeps": lambda value: _check_type("max_sweeps", value, int),
             "tolerance": lambda value: _number("tolerance", value),
             "landmark_deviation": lambda value: _number("landmark_deviation", value),
-            "faces": lambda value: _checked("faces", value, int),
-            "kind": lambda value: _one_of("kind", value, get_args(FaceKind)),
-            "closed": lambda value: None if value is None else _checked("closed", value, bool),
-            "part": lambda value: _one_of("part", value, (*get_args(PartKind), None)),
-            "mirror": lambda value: _checked("mirror", value, bool),
-            "pose": lambda value: _one_of("pose", value, (*get_args(Kind), None)),
+            "faces": lambda value: _check_type("faces", value, int),
+            "kind": lambda value: _check_choice("kind", value, get_args(FaceKind)),
+            "closed": lambda value: None if value is None else _check_type("closed", value, bool),
+            "part": lambda value: _check_choice("part", value, (*get_args(PartKind), None)),
+            "mirror": lambda value: _check_type("mirror", value, bool),
+            "pose": lambda value: _check_choice("pose", value, (*get_args(Kind), None)),
             "tolerance_mm": lambda value: None if value is None else _number("tolerance_mm", value),
-            "most_faces": lambda value: _checked("most_faces", value, int),
-            "most_points": lambda value: None if value is None else _checked("most_points", value, int),
-            "mesh_normals": lambda value: _checked("mesh_normals", value, bool),
-            "limit": lambda value: _checked("limit", value, bool),
+            "most_faces": lambda value: _check_type("most_faces", value, int),
+            "most_points": lambda value: None if value is None else _check_type("most_points", value, int),
+            "mesh_normals": lambda value: _check_type("mesh_normals", value, bool),
+            "limit": lambda value: _check_type("limit", value, bool),
         }
         return cls(**{name: makers[name](value) for name, value in values.items()})
 
@@ -146,57 +146,57 @@ def _known_name(what: str, module: eqx.Module, known: Mapping[str, type]) -> str
     name = type(module).__name__
     if known.get(name) is not type(module):
         raise ValueError(
-            f"a {what} of your own, {name}, has no place in a recipe; those of the package do: {_or(known)}."
+            f"a {what} of your own, {name}, has no place in a recipe; those of the package do: {_join_names(known)}."
         )
     return name
 
 
 def _priors(value: Any) -> Priors:
     if isinstance(value, dict) and value.get("shape") is not None:
-        value = value | {"shape": _from_plain("shape", ShapeModes, value["shape"])}
-    return _from_plain("priors", Priors, value)
+        value = value | {"shape": _decode("shape", ShapeModes, value["shape"])}
+    return _decode("priors", Priors, value)
 
 
-def _to_plain(module: eqx.Module) -> dict[str, Any]:
+def _encode_module(module: eqx.Module) -> dict[str, Any]:
     """The arguments that make a module, as JSON has them."""
-    return {field.name: _plain(getattr(module, field.name)) for field in dataclasses.fields(module) if field.init}
+    return {field.name: _encode(getattr(module, field.name)) for field in dataclasses.fields(module) if field.init}
 
 
-def _plain(value: Any) -> Any:
+def _encode(value: Any) -> Any:
     if value is None or isinstance(value, (str, bool)):
         return value
     if isinstance(value, eqx.Module):
-        return _to_plain(value)
+        return _encode_module(value)
     value = np.asarray(value)
     if value.ndim:
-        return [_plain(row) for row in value]
+        return [_encode(row) for row in value]
     return value.item() if np.isfinite(value) else str(value)  # "inf", "-inf"
 
 
-def _named(what: str, value: Any, known: Mapping[str, type[_M]]) -> _M:
+def _decode_named(what: str, value: Any, known: Mapping[str, type[_M]]) -> _M:
     name = value.get("name") if isinstance(value, dict) else value
     if not isinstance(value, dict) or not isinstance(name, str) or name not in known:
-        raise ValueError(f"`{what}` must have a `name`, one of {_or(known)}; got {name!r}.")
-    return _from_plain(what, known[name], {key: part for key, part in value.items() if key != "name"})
+        raise ValueError(f"`{what}` must have a `name`, one of {_join_names(known)}; got {name!r}.")
+    return _decode(what, known[name], {key: part for key, part in value.items() if key != "name"})
 
 
-def _from_plain(what: str, kind: type[_M], value: Any) -> _M:
+def _decode(what: str, kind: type[_M], value: Any) -> _M:
     if not isinstance(value, dict):
         raise ValueError(f"`{what}` must be an object of names and values; got {value!r}.")
     _refuse_others(f"`{what}`", value, {field.name for field in dataclasses.fields(kind) if field.init})
     try:
-        return kind(**{name: _from_json_value(part) for name, part in value.items()})
+        return kind(**{name: _decode_value(part) for name, part in value.items()})
     except (TypeError, ValueError, AttributeError, OverflowError) as error:
         raise ValueError(f"`{what}` is not as it should be: {error}") from None
 
 
-def _from_json_value(value: Any) -> Any:
+def _decode_value(value: Any) -> Any:
     if isinstance(value, list):
-        return np.array([_from_json_value(row) for row in value])
+        return np.array([_decode_value(row) for row in value])
     return float(value) if value in ("inf", "-inf") and isinstance(value, str) else value
 
 
-def _checked(what: str, value: Any, kinds: type | tuple[type, ...]) -> Any:
+def _check_type(what: str, value: Any, kinds: type | tuple[type, ...]) -> Any:
     if not isinstance(value, kinds) or (isinstance(value, bool) and kinds is not bool):
         wanted = {int: "a whole number", bool: "true or false"}.get(kinds, "a number")  # pyright: ignore
         raise ValueError(f"`{what}` must be {wanted}; got {value!r}.")
@@ -205,22 +205,22 @@ def _checked(what: str, value: Any, kinds: type | tuple[type, ...]) -> Any:
 
 def _number(what: str, value: Any) -> float:
     try:
-        return float(_checked(what, value, (int, float)))
+        return float(_check_type(what, value, (int, float)))
     except OverflowError:
         raise ValueError(f"`{what}` is too large a number.") from None
 
 
-def _one_of(what: str, value: Any, choices: tuple[str | None, ...]) -> Any:
+def _check_choice(what: str, value: Any, choices: tuple[str | None, ...]) -> Any:
     if value not in choices:
-        raise ValueError(f"`{what}` must be one of {_or(map(json.dumps, choices))}; got {json.dumps(value)}.")
+        raise ValueError(f"`{what}` must be one of {_join_names(map(json.dumps, choices))}; got {json.dumps(value)}.")
     return value
 
 
 def _refuse_others(what: str, values: Mapping[str, Any], known: set[str]) -> None:
     others = sorted(set(values) - known)
     if others:
-        raise ValueError(f"{what} has no {', '.join(map(repr, others))}; it has {_or(sorted(known))}.")
+        raise ValueError(f"{what} has no {', '.join(map(repr, others))}; it has {_join_names(sorted(known))}.")
 
 
-def _or(names: Any) -> str:
+def _join_names(names: Any) -> str:
     return ", ".join(names)

@@ -53,9 +53,9 @@ class Model(eqx.Module):
         """The prior of a name, where it is in force."""
         return next((prior for prior in self.priors if prior.name == name), None)
 
-    def bare(self) -> "Model":
+    def strip_strengths(self) -> "Model":
         """The model without what its rows do not depend on."""
-        return dataclasses.replace(self, priors=tuple(prior.bare() for prior in self.priors))
+        return dataclasses.replace(self, priors=tuple(prior.strip_strengths() for prior in self.priors))
 
     @property
     def face_priors(self) -> list[AbstractFacePrior]:
@@ -82,11 +82,20 @@ class Model(eqx.Module):
         values = self.scheme_at(y), self.topology, y.control, missing | y.shared
         return Place(*values, surface, self.template, self.edge)
 
+    def place_of(self, y: Variables) -> Place:
+        """The same with the surface; see `Place.before`."""
+        scheme, topology = self.scheme_at(y), self.topology
+        keeps_normals = scheme.uses_normals and not scheme.recomputes_normals and not topology.mesh_normals
+        if not keeps_normals or topology.real is not None:
+            return self.place(y, self.refine(y))
+        *_, before, surface = js.refine_levels(scheme, topology, y.control)
+        return self.place(y, surface)._replace(before=before)
+
     def retract(self, y: Variables, offset: Unknowns) -> Variables:
         """The variables with an offset put on."""
         return self.layout.retract(y, offset, js.edge_length(self.topology, y.control.vertices))
 
-    def lasting(self, y: Variables) -> Variables:
+    def keep_lasting(self, y: Variables) -> Variables:
         """The variables without the unknowns that only let a step move along with them."""
         kept = {name: y.shared[name] for name, of in self.layout.shared if of.lasting}
         return Variables(y.control, kept)
@@ -117,8 +126,8 @@ class Held(NamedTuple):
 class Residual(eqx.Module):
     """The rows of a fit over their standard deviations, for any least-squares solver of optimistix.
 
-    `residual(y, held)` takes `Variables` and what a sweep holds fixed. `residual.about(y)` is the same as a function of
-    offsets (`Unknowns`) from `y`, each scaled to about 1 mm, in which normals have two coordinates: that is what
+    `residual(y, held)` takes `Variables` and what a sweep holds fixed. `residual.recentre(y)` is the same as a function
+    of offsets (`Unknowns`) from `y`, each scaled to about 1 mm, in which normals have two coordinates: that is what
     `optx.LevenbergMarquardt` and `optx.GaussNewton` solve best.
     """
 
@@ -131,7 +140,7 @@ class Residual(eqx.Module):
 
     def rows(self, y: Variables, held: Held) -> dict[str, Float[Array, "_"]]:
         """The rows before they are weighed, by the name of their prior; those of the scan are "distance"."""
-        place = self.model.place(y, self.model.refine(y))
+        place = self.model.place_of(y)
         assert place.surface is not None
         found = {"distance": self.distances(place, held)}
         return found | {prior.name: prior.rows(place, held.priors[prior.name]) for prior in self.model.priors}
@@ -144,9 +153,9 @@ class Residual(eqx.Module):
         if held.of_points is None or held.shifts is None:
             return distances
         change = (place.shared["shifts"] - held.shifts).astype(distances.dtype)
-        return distances - self.along_shifts(held, change)
+        return distances - self.project_shifts(held, change)
 
-    def along_shifts(self, held: Held, shifts: Float[Array, "s 2"]) -> Float[Array, "p"]:
+    def project_shifts(self, held: Held, shifts: Float[Array, "s 2"]) -> Float[Array, "p"]:
         """How far shifts of slices move each point along its direction."""
         prior = self.model.prior("shift")
         assert isinstance(prior, ShiftPrior) and held.of_points is not None
@@ -154,7 +163,7 @@ class Residual(eqx.Module):
         moved = jnp.sum(shifts[:, :, None] * planes, axis=1)[jnp.maximum(held.of_points, 0)]
         return jnp.where(held.of_points >= 0, dot(held.pairs.directions, moved)[:, 0], 0.0)
 
-    def about(self, y: Variables) -> "OffsetResidual":
+    def recentre(self, y: Variables) -> "OffsetResidual":
         """The same as a function of offsets from `y`."""
         return OffsetResidual(self, y)
 
@@ -208,7 +217,7 @@ def analyse(
     owner = js.control_faces_of(scheme, topology, surface, control)
     start = Start(scheme, topology, control, surface, owner, has_normals, has_h, inputs)
     made = [prior for kind in REGISTER if (prior := kind.make(priors, start)) is not None]
-    shared = {name: of for prior in made for name, of in prior.shared().items()}
+    shared = {name: of for prior in made for name, of in prior.shared_unknowns().items()}
     layout = Layout(n_vertices, has_vertices, has_normals, tuple(shared.items()))
     rows = [
         np.repeat(np.asarray(masks[name])[:, None], width, axis=1)
@@ -217,7 +226,7 @@ def analyse(
     ]
     own = np.concatenate(rows, axis=1).ravel() if rows else np.zeros(0)
     is_free = np.concatenate([own, np.ones(layout.n - layout.n_own)]).astype(float)
-    values = {name: value for prior in made for name, value in prior.initial().items()}
+    values = {name: value for prior in made for name, value in prior.initial_values().items()}
     edge = jnp.asarray(js.edge_length(topology, control.vertices))
     model = Model(scheme, topology, tuple(made), layout, is_free, control.vertices, edge)
     return model, Variables(control, values)

@@ -141,7 +141,7 @@ class Layout(eqx.Module):
             first += size
         raise KeyError(name)
 
-    def of_vertices(self, rows: AnyArray, xp: Any = np) -> AnyArray:
+    def repeat_per_unknown(self, rows: AnyArray, xp: Any = np) -> AnyArray:
         """A value a control vertex `[v]` as one an unknown of a vertex `[n_own]`."""
         return xp.repeat(rows, self.width)
 

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 import jaxsubdiv as js
+from jaxsubdiv.extras import import_extra
 
 from .picture import make_figure
 from .series import SeriesFit
@@ -34,10 +35,8 @@ def animate_series(series: SeriesFit, *, pixels: int = 300) -> bytes:
     Raises:
         ImportError: matplotlib is missing; it comes with the extra `viz`.
     """
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise ImportError("pictures need matplotlib: pip install 'jaxsubdiv[viz]'") from error
+    import_extra("matplotlib", "viz", "pictures")
+    from PIL import Image
 
     surfaces = [series.surface(k) for k in range(len(series))]
     first = np.asarray(surfaces[0].vertices, np.float64)

@@ -73,7 +73,7 @@ class SurfaceAtLevel:
         if self.levels < own or len(self.surface.vertices) * n_seeds <= _MOST_DERIVATIVES:
             return posterior.deviations_of(self.topology)
         coarser = SurfaceAtLevel(self.fit, self.levels - 1, self.posterior)
-        return _interpolated(coarser.surface, coarser.deviations, self.surface)
+        return _interpolate(coarser.surface, coarser.deviations, self.surface)
 
 
 def _topology(fit: Fit, levels: int) -> js.Topology:
@@ -88,7 +88,7 @@ def _topology(fit: Fit, levels: int) -> js.Topology:
     return js.build_topology(mesh, fit.model.scheme, levels, mesh_normals=settings.mesh_normals, limit=settings.limit)
 
 
-def _interpolated(
+def _interpolate(
     coarse: js.RefinedSurface, values: Float[np.ndarray, "v"], fine: js.RefinedSurface
 ) -> Float[np.ndarray, "w"]:
     """Values of the vertices of a surface at those of a finer one, from where these are closest."""

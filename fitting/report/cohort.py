@@ -16,7 +16,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 import jaxsubdiv as js
-from jaxsubdiv.files import replacing
+from jaxsubdiv.files import replace_file
 
 from ..finding import Finding
 from ..scan.scan import Scan
@@ -96,10 +96,10 @@ class Cohort:
             ),
             converged=np.array([bool(one.result == optx.RESULTS.successful) for one in results]),
             sweeps=np.array([len(one.rms) - 1 for one in results]),
-            rms=fill_rows([one.rms for one in results], np.nan),
-            robust_rms=fill_rows([one.robust_rms for one in results], np.nan),
+            rms=pad_rows([one.rms for one in results], np.nan),
+            robust_rms=pad_rows([one.robust_rms for one in results], np.nan),
             noise=np.array([one.noise for one in results]),
-            weights=fill_rows([one.weights for one in results], 0.0),
+            weights=pad_rows([one.weights for one in results], 0.0),
             scans=tuple(one.scan for one in results),
             names=name_subjects(len(results), names),
             _results=results.__getitem__,
@@ -125,7 +125,7 @@ class Cohort:
         folder = Path(folder)
         for i, name in enumerate(self.names):
             self.result(i).save(folder / name)
-        with replacing(folder / COHORT) as path:
+        with replace_file(folder / COHORT) as path:
             path.write_text(json.dumps({"names": self.names}, indent=2) + "\n", encoding="utf-8")
         for left in folder.glob(CHECKPOINT_OF_COHORT.format("*")):
             left.unlink(missing_ok=True)
@@ -158,7 +158,7 @@ def name_subjects(n: int, names: Sequence[str] | None) -> tuple[str, ...]:
     return names
 
 
-def fill_rows(rows: Sequence[Float[np.ndarray, "_"]], value: float) -> Float[np.ndarray, "s m"]:
+def pad_rows(rows: Sequence[Float[np.ndarray, "_"]], value: float) -> Float[np.ndarray, "s m"]:
     """Rows of different lengths as one array."""
     found = np.full((len(rows), max(map(len, rows))), value)
     for row, own in zip(found, rows, strict=True):

@@ -38,7 +38,7 @@ def distances_to_scan(surface: js.RefinedSurface, seen: Look, inliers: Bool[np.n
     the usual distance from one to the next.
     """
     vertices, normals = np.asarray(surface.vertices, np.float64), unit(np.asarray(surface.normals, np.float64))
-    feet, sides = at_pairs(vertices, seen)[inliers], unit(at_pairs(normals, seen))[inliers]
+    feet, sides = take_at_pairs(vertices, seen)[inliers], unit(take_at_pairs(normals, seen))[inliers]
     if not len(feet):
         return np.full(len(vertices), np.nan)
     tree = KDTree(feet)
@@ -62,7 +62,7 @@ def worst_places(
         edge: length of a control edge in mm; places are at least so far apart.
         n: how many at most.
     """
-    on = at_pairs(np.asarray(surface.vertices, np.float64), seen)
+    on = take_at_pairs(np.asarray(surface.vertices, np.float64), seen)
     many, centres = (slice(None, None, -(-len(on) // most)) for most in (_MANY, _CENTRES))
     a_disc = np.pi * (edge / 4) ** 2 / float(surface.areas().sum())
     k = min(int(np.clip(len(on[many]) * a_disc, *_NEAR_PLACE)), len(on[many]))
@@ -92,7 +92,7 @@ def _spacing(tree: KDTree, points: Float[np.ndarray, "p 3"]) -> float:
     return float(np.median(away[away > 0])) if np.any(away > 0) else 0.0
 
 
-def at_pairs(values: Float[np.ndarray, "v 3"], seen: Look) -> Float[np.ndarray, "p 3"]:
+def take_at_pairs(values: Float[np.ndarray, "v 3"], seen: Look) -> Float[np.ndarray, "p 3"]:
     """Values at the surface points that are paired with the scan."""
     weights = np.asarray(seen.pairs.corner_weights, np.float64)
     return np.einsum("pk,pkx->px", weights, values[np.asarray(seen.pairs.corners)])

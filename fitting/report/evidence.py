@@ -11,9 +11,9 @@ import jaxsubdiv as js
 from ..model.pairing import Scene
 from ..scan.closest_points import nearest_rows
 from ..scan.outliers import first_of_each
-from ..start.cloud import on_lines, rows_on_surfaces
+from ..start.cloud import are_on_lines, rows_on_surfaces
 from ..start.orient import plane_fits
-from .coverage import at_pairs, unit
+from .coverage import take_at_pairs, unit
 from .record import Fit
 
 _MOST = 20_000  # points that are looked at: an even part of more tells as much
@@ -55,13 +55,13 @@ def own_noise(points: Float[np.ndarray, "p 3"], counted: Bool[np.ndarray, "p"]) 
         rows = rows[rows_on_surfaces(points[rows])]
     sampled[rows] = True
     some = points[rows]
-    if len(rows) <= 2 * _NEIGHBOURS or on_lines(some):
+    if len(rows) <= 2 * _NEIGHBOURS or are_on_lines(some):
         return OwnNoise(sampled, np.nan)
     _, off, _ = plane_fits(some, _NEIGHBOURS)
     return OwnNoise(sampled, float(np.median(off)) / _LEFT**0.5)
 
 
-def among_their_own(points: Float[np.ndarray, "p 3"], chosen: Bool[np.ndarray, "p"]) -> Bool[np.ndarray, "p"]:
+def are_among_their_own(points: Float[np.ndarray, "p 3"], chosen: Bool[np.ndarray, "p"]) -> Bool[np.ndarray, "p"]:
     """Which of the chosen points have mostly others of them around: those of an object, not stray ones."""
     own = chosen.copy()
     if chosen.any():
@@ -130,11 +130,11 @@ def rests_far_off(scene: Scene, noise: float, edge: float, robust_rms: Float[np.
     """
     if noise < NOISE_OVER_EDGE * edge or robust_rms[-1] < _HARDLY_FELL * robust_rms[0]:
         return False
-    own = own_noise(np.asarray(scene.scan.points, np.float64), _counted(scene)).noise
+    own = own_noise(np.asarray(scene.scan.points, np.float64), _find_counted(scene)).noise
     return not noise < NOISE_OVER_OWN * own  # of points along lines nothing is known, and nothing explains it
 
 
-def _counted(scene: Scene) -> Bool[np.ndarray, "p"]:
+def _find_counted(scene: Scene) -> Bool[np.ndarray, "p"]:
     """Points that have a weight, and are not scattered."""
     return (np.asarray(scene.scan.weights_or_ones()) > 0) & ~np.asarray(scene.around.scattered)
 
@@ -143,7 +143,7 @@ def gather_evidence(
     fit: Fit, surface: js.RefinedSurface, areas: Float[np.ndarray, "v"], covered: Bool[np.ndarray, "v"]
 ) -> Evidence:
     """All that the checks look at."""
-    look, counted = fit.look, _counted(fit.scene)
+    look, counted = fit.look, _find_counted(fit.scene)
     return Evidence(
         fit=fit,
         surface=surface,
@@ -152,8 +152,8 @@ def gather_evidence(
         noise=float(look.noise),
         distances=np.asarray(look.distances, np.float64),
         inliers=fit.inliers,
-        feet=at_pairs(np.asarray(surface.vertices, np.float64), look),
-        sides=unit(at_pairs(np.asarray(surface.normals, np.float64), look)),
+        feet=take_at_pairs(np.asarray(surface.vertices, np.float64), look),
+        sides=unit(take_at_pairs(np.asarray(surface.normals, np.float64), look)),
         areas=areas,
         covered=covered,
     )

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..finding import Finding
 from .coverage import unit
-from .evidence import NOISE_OVER_EDGE, NOISE_OVER_OWN, Evidence, among_their_own, find_two_walls, rests_far_off
+from .evidence import NOISE_OVER_EDGE, NOISE_OVER_OWN, Evidence, are_among_their_own, find_two_walls, rests_far_off
 
 # Each limit lies between the fits that are wrong and those that are right of tests/bench/fit_trust.py.
 _UNEXPLAINED_FAR, _FAR, _UNEXPLAINED = 0.03, 0.1, 0.08  # far: in control edges
@@ -71,7 +71,7 @@ def check_unexplained_points(seen: Evidence) -> Finding | None:
     """Whether points that lie on some surface lie on this one."""
     there = seen.own.sampled
     off = there.copy()
-    off[there] = among_their_own(np.asarray(seen.fit.look.pairs.points, np.float64)[there], ~seen.inliers[there])
+    off[there] = are_among_their_own(np.asarray(seen.fit.look.pairs.points, np.float64)[there], ~seen.inliers[there])
     share = float(off.sum() / max(there.sum(), 1))
     if share < _UNEXPLAINED_FAR:
         return None

@@ -66,14 +66,14 @@ class Measures:
     def volumes(self) -> dict[str, int]:
         """The column of the volume of every part that has one of its own, by its name."""
         rows = {column.name: i for i, column in enumerate(self.columns)}
-        return {self.parts[i].name: rows[f"volume {self.parts[i].name}"] for i in self._closed()}
+        return {self.parts[i].name: rows[f"volume {self.parts[i].name}"] for i in self._find_closed()}
 
-    def _closed(self) -> list[int]:
+    def _find_closed(self) -> list[int]:
         """Parts whose volume is measured: cavities, or all of a surface that is open."""
         return list(range(len(self.parts))) if not self.is_closed else self.cavities
 
     def _columns(self) -> list[Column]:
-        found = [Column(f"volume {self.parts[i].name}", "ml") for i in self._closed()]
+        found = [Column(f"volume {self.parts[i].name}", "ml") for i in self._find_closed()]
         if self.is_closed:
             found += [Column("wall volume" if self.cavities else "volume", "ml")]
             found += [Column("wall mass", "g")] * bool(self.cavities)
@@ -95,7 +95,7 @@ class Measures:
     def measure(self, surface: js.RefinedSurface, walls: Sequence[Walls]) -> Float[Array, "m"]:
         """The numbers of a surface, in the order of `columns`."""
         x = surface.vertices
-        found = [_ML * jnp.abs(js.losses.enclosed_volume(surface, part=self._parts[i])) for i in self._closed()]
+        found = [_ML * jnp.abs(js.losses.enclosed_volume(surface, part=self._parts[i])) for i in self._find_closed()]
         if self.is_closed:
             whole = _ML * js.losses.enclosed_volume(surface, part=self._whole)
             found += [whole, DENSITY * whole] if self.cavities else [whole]

@@ -12,12 +12,12 @@ from jaxtyping import Float
 from numpy.typing import DTypeLike
 
 import jaxsubdiv as js
-from jaxsubdiv.console import printable
-from jaxsubdiv.files import replacing
+from jaxsubdiv.console import make_printable
+from jaxsubdiv.files import replace_file
 
 from ..image.slices import Slice
 from .coverage import distances_to_scan
-from .picture import as_png, draw_slices
+from .picture import draw_slices, encode_png
 from .report import Report
 from .result import FitResult
 
@@ -52,7 +52,7 @@ def write_page(
     """
     report = result.report(uncertainty=uncertainty)
     first = result.start if start is None else start
-    here, title = Path(__file__).parent, html.escape(printable(title) or "Fit")
+    here, title = Path(__file__).parent, html.escape(make_printable(title) or "Fit")
     parts = {
         "TITLE": title,
         "STATE_CLASS": "" if report.trusted else ' class="bad"',
@@ -70,7 +70,7 @@ def write_page(
     }
     pieces = (here / "page.html").read_text(encoding="utf-8").split("@@")
     pieces[1::2] = [parts[name] for name in pieces[1::2]]  # in one pass: a title may hold what looks like a name
-    with replacing(path) as unfinished:
+    with replace_file(path) as unfinished:
         unfinished.write_text("".join(pieces), encoding="utf-8")
 
 
@@ -90,19 +90,22 @@ def _data(
         "centre": centre.tolist(),
         "radius": max(radius, 1e-9),
         "view": js.view_of(surface).ravel().tolist(),
-        "surface": {"vertices": _floats(vertices), "triangles": _whole(np.asarray(surface.triangles()))},
-        "distance": {"values": _floats(distances), "limit": _limit(np.abs(result.distances))},
-        "deviation": None if deviation is None else {"values": _floats(deviation), "limit": _limit(deviation)},
+        "surface": {
+            "vertices": _encode_floats(vertices),
+            "triangles": _encode_indices(np.asarray(surface.triangles())),
+        },
+        "distance": {"values": _encode_floats(distances), "limit": _limit(np.abs(result.distances))},
+        "deviation": None if deviation is None else {"values": _encode_floats(deviation), "limit": _limit(deviation)},
         "points": {
-            "vertices": _floats(result.points[some]),
-            "values": _floats(result.distances[some]),
+            "vertices": _encode_floats(result.points[some]),
+            "values": _encode_floats(result.distances[some]),
         },
         "control": {
-            "vertices": _floats(mesh.vertices),
-            "triangles": _whole(_as_triangles(mesh)),
-            "edges": _whole(mesh.half_edges.edges),
+            "vertices": _encode_floats(mesh.vertices),
+            "triangles": _encode_indices(_triangulate(mesh)),
+            "edges": _encode_indices(mesh.half_edges.edges),
         },
-        "start": None if start is None else _floats(np.asarray(start.vertices)),
+        "start": None if start is None else _encode_floats(np.asarray(start.vertices)),
         "places": [
             {
                 "position": place.position,
@@ -127,7 +130,7 @@ def _slices(result: FitResult, slices: Sequence[Slice]) -> str:
     if not slices:
         return ""
     try:
-        picture = base64.b64encode(as_png(draw_slices(result, slices))).decode("ascii")
+        picture = base64.b64encode(encode_png(draw_slices(result, slices))).decode("ascii")
     except ImportError:  # the page itself needs nothing
         return ""
     name = "the fitted surface's contour over three slices of the image"
@@ -150,20 +153,20 @@ def _limit(values: Float[np.ndarray, "n"]) -> float:
     return max(float(np.percentile(values, 98)), 1e-6)
 
 
-def _as_triangles(mesh: js.ControlMesh) -> np.ndarray:
+def _triangulate(mesh: js.ControlMesh) -> np.ndarray:
     quads = mesh.faces[4]
     return np.concatenate([mesh.faces[3], quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
-def _floats(values: np.ndarray) -> str:
-    return _base64(values, "<f4")
+def _encode_floats(values: np.ndarray) -> str:
+    return _encode_base64(values, "<f4")
 
 
-def _whole(values: np.ndarray) -> str:
-    return _base64(values, "<u4")
+def _encode_indices(values: np.ndarray) -> str:
+    return _encode_base64(values, "<u4")
 
 
-def _base64(values: np.ndarray, dtype: DTypeLike) -> str:
+def _encode_base64(values: np.ndarray, dtype: DTypeLike) -> str:
     return base64.b64encode(np.ascontiguousarray(values, dtype).tobytes()).decode("ascii")
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 import jaxsubdiv as js
-from jaxsubdiv.console import printable
+from jaxsubdiv.console import make_printable
+from jaxsubdiv.extras import import_extra
 
 from ..image.slices import Slice
 from .result import FitResult
@@ -36,7 +37,7 @@ def draw_fit(result: FitResult, start: js.ControlMesh, *, title: str = "", slice
         ImportError: matplotlib is missing; it comes with the extra `viz`.
     """
     figure = make_figure(15.0, 14.25 if slices else 9.5)
-    figure.suptitle(printable(title), fontsize=14, parse_math=False)  # a `$` in a name is no formula
+    figure.suptitle(make_printable(title), fontsize=14, parse_math=False)  # a `$` in a name is no formula
     (before, after, smooth), (error, counts, convergence), *below = figure.subplots(3 if slices else 2, 3)
     view, surface = js.view_of(result.surface), result.surface
     for ax, vertices, name in (
@@ -70,7 +71,7 @@ def draw_slices(result: FitResult, slices: Sequence[Slice]) -> "Figure":
     return figure
 
 
-def as_png(figure: "Figure") -> bytes:
+def encode_png(figure: "Figure") -> bytes:
     """A figure as the bytes of a PNG file."""
     file = io.BytesIO()
     figure.savefig(file, format="png")
@@ -78,10 +79,8 @@ def as_png(figure: "Figure") -> bytes:
 
 
 def make_figure(width: float, height: float) -> "Figure":
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError("pictures need matplotlib: pip install 'jaxsubdiv[viz]'") from error
+    import_extra("matplotlib", "viz", "pictures")
+    from matplotlib.figure import Figure
 
     class Picture(Figure):
         """A figure that notebooks show where pyplot, which would tell them how, was never imported."""
@@ -92,7 +91,7 @@ def make_figure(width: float, height: float) -> "Figure":
                 super().draw(renderer)
 
         def _repr_png_(self) -> bytes:
-            return as_png(self)
+            return encode_png(self)
 
     return Picture(figsize=(width, height), layout="constrained", dpi=100)
 
@@ -110,7 +109,7 @@ def _draw_slice(ax: Any, one: Slice, surface: js.RefinedSurface) -> None:
 
 def _draw_error(ax: Any, result: FitResult, view: Float[np.ndarray, "3 3"]) -> None:
     limit = _limit(result, 98.0)
-    distances = result.at_level().distances
+    distances = result.refine_to().distances
     colours = js.draw_surface(ax, result.surface, view=view, values=distances, limits=(-limit, limit), cmap=_COLOURS)
     ax.set_title("distance of the scan from it")
     below = ax.inset_axes((0.1, -0.08, 0.8, 0.03))

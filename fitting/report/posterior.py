@@ -16,9 +16,10 @@ from jaxtyping import Float, Int
 import jaxsubdiv as js
 from jaxsubdiv.linalg import unit
 
-from ..model.pairing import on_boundary
+from ..model.pairing import is_on_boundary
 from ..scan.closest_points import boundary_vertices
-from ..solve.elements import differentiate_across, face_corners, slopes_of_rows, times_transposed
+from ..solve.derivatives import differentiate_across
+from ..solve.elements import face_corners, slopes_of_rows, times_transposed
 from ..solve.strengths import neighbourhood_mean
 from .misfit import misfit_variances
 from .record import Fit
@@ -43,7 +44,7 @@ class Posterior:
     def __init__(self, fit: Fit):
         self.fit = fit
         self.equations = fit.equations()
-        matrix = self.equations.data.plus(self.equations.prior)
+        matrix = self.equations.data.add(self.equations.prior)
         self.factor = self.equations.factorise(matrix, fit.loose, fit.active)
 
     def uncertainty(self) -> Uncertainty:
@@ -54,7 +55,8 @@ class Posterior:
     def _uncertainty(self) -> Uncertainty:
         structure = self.equations.structure
         of_control, of_surface = self._control_variances(), self._surface_variances
-        misfit = _at_vertices(self._misfit_of_faces, structure.corners, structure.patches.owner, len(of_surface))
+        patches = structure.patches
+        misfit = _average_corners(self._misfit_of_faces, patches.corners, patches.owner, len(of_surface))
         return Uncertainty(np.sqrt(of_control), np.sqrt(of_surface + misfit), np.sqrt(misfit))
 
     def deviations_of(self, topology: js.Topology) -> Float[np.ndarray, "w"]:
@@ -67,16 +69,16 @@ class Posterior:
         face = np.zeros(len(surface.vertices), np.int64)
         face[corners] = owner[:, None]
         across = np.asarray(differentiate_across(model, fit.y, elements.seeds, surface.normals))
-        variances = self._variances(face, lambda rows: slopes_of_rows(elements, across[rows], face[rows]))
-        return np.sqrt(variances + _at_vertices(self._misfit_of_faces, corners, owner, len(variances)))
+        variances = self._variances(face, lambda rows: slopes_of_rows(elements, across[:, rows], face[rows]))
+        return np.sqrt(variances + _average_corners(self._misfit_of_faces, corners, owner, len(variances)))
 
     @functools.cached_property
     def _surface_variances(self) -> Float[np.ndarray, "w"]:
         """Of every vertex of the surface along its normal."""
         structure, normals = self.equations.structure, np.asarray(self.fit.surface().normals)
-        across = np.einsum("vxs,vx->vs", np.asarray(self.equations.found.of_surface), normals)
+        across = np.einsum("svx,vx->sv", np.asarray(self.equations.found.of_surface), normals)
         face = structure.faces_of_vertices(len(normals))
-        return self._variances(face, lambda rows: slopes_of_rows(structure.elements, across[rows], face[rows]))
+        return self._variances(face, lambda rows: slopes_of_rows(structure.elements, across[:, rows], face[rows]))
 
     def _variances(
         self, face: Int[np.ndarray, "w"], derivatives: Callable[[Int[np.ndarray, "r"]], Float[np.ndarray, "r d"]]
@@ -104,7 +106,7 @@ class Posterior:
         structure = self.equations.structure
         owner = structure.patches.owner[np.asarray(at.face)]
         corners, weights = (np.asarray(part) for part in js.corner_weights(self.fit.surface(), at))
-        along = np.einsum("pc,pcxs->pxs", weights, np.asarray(self.equations.found.of_surface)[corners])
+        along = np.einsum("pc,spcx->pxs", weights, np.asarray(self.equations.found.of_surface)[:, corners])
         by = np.take_along_axis(along, structure.elements.seeds_of[owner][:, None], axis=2).astype(np.float64)
         blocks = self.factor.covariance_blocks(self._free_columns(structure.elements.columns[owner]))
         return np.einsum("pxd,pde,pye->pxy", by, blocks, by, optimize=True)
@@ -112,10 +114,10 @@ class Posterior:
     def covariance_of(self, gradients: Float[np.ndarray, "m v 3"]) -> Float[np.ndarray, "m m"]:
         """Of numbers that depend on the surface, from their gradients by its vertices; without the misfit."""
         elements, of_surface = self.equations.structure.elements, np.asarray(self.equations.found.of_surface)
-        face = self.equations.structure.faces_of_vertices(len(of_surface))
+        face = self.equations.structure.faces_of_vertices(of_surface.shape[1])
         sides = np.zeros((self.fit.model.layout.n, len(gradients)))
         for i, gradient in enumerate(gradients):
-            across = np.einsum("vxs,vx->vs", of_surface, gradient.astype(of_surface.dtype))
+            across = np.einsum("svx,vx->sv", of_surface, gradient.astype(of_surface.dtype))
             slopes = slopes_of_rows(elements, across, face)
             sides[: elements.n, i] = times_transposed(elements, slopes, np.ones(len(face)), face)
         return self.covariance_by_unknowns(sides)
@@ -154,7 +156,7 @@ class Posterior:
         owner = structure.patches.owner
         pairs, open_vertices = look.pairs, boundary_vertices(surface)
         # Where a surface ends, distances run along it.
-        counted = ~np.asarray(on_boundary(open_vertices, pairs.corners, pairs.corner_weights))
+        counted = ~np.asarray(is_on_boundary(open_vertices, pairs.corners, pairs.corner_weights))
         at_points = np.sum(np.asarray(pairs.corner_weights, np.float64) * variances[np.asarray(pairs.corners)], axis=1)
         weights = np.asarray(look.precisions, np.float64) * counted
         distances, face = np.asarray(look.distances, np.float64), np.asarray(look.at.face)
@@ -171,7 +173,7 @@ class Posterior:
         return drawn * self._is_free
 
 
-def _at_vertices(
+def _average_corners(
     of_faces: Float[np.ndarray, "f"], corners: Int[np.ndarray, "g 4"], owner: Int[np.ndarray, "g"], n: int
 ) -> Float[np.ndarray, "n"]:
     """Of the vertices of a surface, means of the control faces that they lie on."""

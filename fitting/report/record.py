@@ -116,14 +116,14 @@ class Fit:
         """The surface found."""
         return self.model.refine(self.y)
 
-    def held(self) -> Held:
+    def gather_held(self) -> Held:
         """What the sweep after the last would hold fixed: the `args` of its residual."""
         held, _ = hold_priors(self.model, self.y, self.surface(), self.strengths.values, self.scene)
         return hold_sweep(self.model, self.y, self.scene, self.look, self.look.at, self.strengths, held)
 
     def equations(self) -> SparseEquations:
         """The normal equations about the surface found."""
-        held = self.held()
+        held = self.gather_held()
         structure = self.structure or find_structure(self.model, self.y, held.priors)
         return SparseEquations(structure, self.model, self.y, held)
 

@@ -137,21 +137,21 @@ def make_refit(posterior: Posterior) -> Refit:
     # Where control vertices turned back from sweep to sweep the cost need not be convex, unless they are held.
     whitening[which] = np.linalg.inv(np.linalg.cholesky(equations.to_dense(fit.last_hold, which))).T
 
-    def on_device(values: Any) -> Any:
+    def put_on_device(values: Any) -> Any:
         is_float = isinstance(values, (np.ndarray, Array)) and jnp.issubdtype(values.dtype, jnp.floating)
         return jnp.asarray(values, dtype if is_float else None)
 
-    held = jax.tree.map(on_device, equations.held._replace(of_points=None, shifts=None))
+    held = jax.tree.map(put_on_device, equations.held._replace(of_points=None, shifts=None))
     shifts = None
     if fit.shifting and fit.scene.of_points is not None:
-        shifts = on_device(shift_points(fit.model, fit.y.shared["shifts"], fit.scene.of_points))
+        shifts = put_on_device(shift_points(fit.model, fit.y.shared["shifts"], fit.scene.of_points))
     fixed = _Fixed(
         model=fit.model,
         y=fit.y,
         held=held,
         shifts=shifts,
-        hold=on_device(fit.last_hold),
-        whitening=on_device(whitening),
+        hold=put_on_device(fit.last_hold),
+        whitening=put_on_device(whitening),
         left=jnp.zeros(len(which), dtype),
     )
     points = held.pairs.points if shifts is None else held.pairs.points - shifts  # the scan's own

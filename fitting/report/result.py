@@ -90,7 +90,7 @@ class FitResult:
         """
         return self.posterior.uncertainty()
 
-    def at_level(self, levels: int | None = None) -> SurfaceAtLevel:
+    def refine_to(self, levels: int | None = None) -> SurfaceAtLevel:
         """The surface at another level of refinement, with the scan's distances and the uncertainty at its vertices.
 
         Args:
@@ -169,7 +169,7 @@ class FitResult:
             )
         return make_refit(self.posterior)
 
-    def on(self, scan: Scan) -> "FitResult":
+    def compare_with(self, scan: Scan) -> "FitResult":
         """The same surface, measured by another scan: by all points of the one of which a part was fitted, say.
 
         Correspondences, distances, noise, report and uncertainty are those of its points; the convergence is that of

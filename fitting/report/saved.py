@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 import jaxsubdiv as js
 from jaxsubdiv.archives import read_arrays
-from jaxsubdiv.files import replacing
+from jaxsubdiv.files import replace_file
 from jaxsubdiv.frames import Frame
 
 from ..finding import Origin
@@ -110,9 +110,9 @@ def save_fit(
             arrays |= {f"{name}_{field}": getattr(inputs[name], field) for field in kind._fields}
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    with replacing(folder / _RECIPE) as path:
+    with replace_file(folder / _RECIPE) as path:
         path.write_text(text + "\n", encoding="utf-8")
-    with replacing(folder / _FIT) as path:  # last: where it is, all is
+    with replace_file(folder / _FIT) as path:  # last: where it is, all is
         as_numpy: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items() if value is not None}
         np.savez(path, **as_numpy)
 
@@ -198,7 +198,7 @@ def _expected_faces(arrays: dict[str, np.ndarray], model: Model) -> Bool[np.ndar
     return None if alike.all() else alike
 
 
-def _shifts_within(arrays: dict[str, np.ndarray], planes: SlicePlanes) -> Float[np.ndarray, "s 2"]:
+def _project_shifts(arrays: dict[str, np.ndarray], planes: SlicePlanes) -> Float[np.ndarray, "s 2"]:
     """The shifts of version 3, which are vectors, along the axes of their slices' planes."""
     if "shifts" not in arrays:
         return np.zeros((len(planes.numbers), 2))
@@ -241,7 +241,7 @@ def _match_of(arrays: dict[str, np.ndarray], n_faces: int) -> RegionMatch | None
 
 
 def _restore(arrays: dict[str, np.ndarray]) -> Fit:
-    def on_device(name: str) -> Array:
+    def put_on_device(name: str) -> Array:
         values = arrays[name]
         return jnp.asarray(values, jnp.result_type(float) if values.dtype.kind == "f" else None)
 
@@ -250,12 +250,12 @@ def _restore(arrays: dict[str, np.ndarray]) -> Fit:
     if mesh.n_faces * 4 ** min(max(settings.levels, 0), 99) > _MOST_FACES:
         raise ValueError(f"{settings.levels} levels of {mesh.n_faces} faces are more than a fit has. It is damaged.")
     topology = settings.topology(mesh)
-    start = js.Control(on_device("template"), on_device("start_normals"))
+    start = js.Control(put_on_device("template"), put_on_device("start_normals"))
     of_points: dict[str, Any] = {name: arrays.get(f"scan_{name}") for name in _OF_SCAN}
     scan = Scan(**of_points, frame=_frame_of(arrays), regions=_regions_of(arrays, "scan"))
     inputs: dict[str, Any] = {"alike": arrays.get("alike"), "regions": _match_of(arrays, mesh.n_faces)}
     if "anchor_points" in arrays:
-        inputs["landmarks"] = Anchors(*(on_device(f"anchor_{name}") for name in Anchors._fields))
+        inputs["landmarks"] = Anchors(*(put_on_device(f"anchor_{name}") for name in Anchors._fields))
     if "symmetry_partner" in arrays:
         inputs["symmetry"] = symmetry_of(arrays["symmetry_partner"], arrays["template"])
     if "boundary_points" in arrays:
@@ -276,12 +276,12 @@ def _restore(arrays: dict[str, np.ndarray]) -> Fit:
     if int(arrays["version"]) == 3 and "shifts" in first.shared:
         planes = inputs["slices"]
         assert planes is not None
-        arrays["shared_shifts"] = _shifts_within(arrays, planes)
-    shared = {name: on_device(f"shared_{name}") for name in first.shared}
+        arrays["shared_shifts"] = _project_shifts(arrays, planes)
+    shared = {name: put_on_device(f"shared_{name}") for name in first.shared}
     for name, value in shared.items():
         if value.shape != (usual := first.shared[name]).shape:
             raise ValueError(f"'shared_{name}' has the shape {list(value.shape)} and not {list(usual.shape)}.")
-    y = Variables(js.Control(on_device("control_vertices"), on_device("control_normals")), shared)
+    y = Variables(js.Control(put_on_device("control_vertices"), put_on_device("control_normals")), shared)
     surface = model.refine(y)
     face = arrays["face"]
     if not ((face >= 0) & (face < surface.n_faces)).all():
@@ -291,16 +291,16 @@ def _restore(arrays: dict[str, np.ndarray]) -> Fit:
     points = scan.points
     if shifting and scene.of_points is not None:
         points = points + shift_points(model, y.shared["shifts"], scene.of_points).astype(points.dtype)
-    at = js.SurfacePoint(face, on_device("uv"))
+    at = js.SurfacePoint(face, put_on_device("uv"))
     rms, robust_rms = arrays["rms"], arrays["robust_rms"]
     look = Look(
         at=at,
-        pairs=Pairs(points, *js.corner_weights(surface, at), on_device("directions")),
-        distances=on_device("distances"),
-        weights=on_device("weights"),
-        precisions=on_device("precisions"),
-        noise=on_device("noise"),
-        scale=on_device("scale"),
+        pairs=Pairs(points, *js.corner_weights(surface, at), put_on_device("directions")),
+        distances=put_on_device("distances"),
+        weights=put_on_device("weights"),
+        precisions=put_on_device("precisions"),
+        noise=put_on_device("noise"),
+        scale=put_on_device("scale"),
         rms=jnp.asarray(rms[-1], jnp.result_type(float)),
         robust_rms=jnp.asarray(robust_rms[-1], jnp.result_type(float)),
     )

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 import jaxsubdiv as js
-from jaxsubdiv.files import replacing
+from jaxsubdiv.files import replace_file
 
 from ..scan.frames import Frames
 from ..scan.scan import Scan
@@ -140,7 +140,7 @@ class SeriesFit:
             OSError, ValueError: as `FitResult.save`.
         """
         save_fit(folder, self.result.fit, self.result.recipe, marks)
-        with replacing(Path(folder) / _SERIES) as path:
+        with replace_file(Path(folder) / _SERIES) as path:
             path.write_text(json.dumps({"names": self.names, "valves": self.valves}, indent=2) + "\n", encoding="utf-8")
 
 

@@ -7,8 +7,8 @@ import os
 import numpy as np
 from jaxtyping import Float
 
-from jaxsubdiv.console import printable
-from jaxsubdiv.files import replacing
+from jaxsubdiv.console import make_printable
+from jaxsubdiv.files import replace_file
 
 from .animation import animate_series
 from .series import SeriesFit
@@ -49,7 +49,7 @@ def write_series_page(
         title: above the page; default: "Series".
         animation: of the surface; default: what `animate_series` draws.
     """
-    title, table = html.escape(printable(title) or "Series"), series.table
+    title, table = html.escape(make_printable(title) or "Series"), series.table
     try:
         animation = animate_series(series) if animation is None else animation
         picture = base64.b64encode(animation).decode("ascii")
@@ -81,7 +81,7 @@ def write_series_page(
 </body>
 </html>
 """
-    with replacing(path) as unfinished:
+    with replace_file(path) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
 
 
@@ -132,7 +132,7 @@ def _chart(table: SeriesTable, names: list[str], label: str) -> str:
         lines.append(f'<polyline points="{_points(x, y(values))}" fill="none" stroke="{hue}" stroke-width="2"/>')
         if len(names) > 1:
             at = f'x="{_LEFT + 8}" y="{_TOP + 14 + 15 * i}"'
-            lines.append(f'<text {at} style="fill: {hue}">{html.escape(printable(name))}</text>')
+            lines.append(f'<text {at} style="fill: {hue}">{html.escape(make_printable(name))}</text>')
     for i in range(0, n, max(-(-n // 8), 1)):
         lines.append(f'<text x="{x[i]:.1f}" y="{base + 16}" text-anchor="middle">{i}</text>')
     lines.append(f'<text x="{(_LEFT + _WIDTH) / 2:.1f}" y="{_HEIGHT - 6}" text-anchor="middle">frame</text>')
@@ -148,5 +148,5 @@ def _table(table: SeriesTable) -> str:
     rows = [f"<tr><th>frame</th>{heads}</tr>"]
     for name, values, deviations in zip(table.names, table.values, table.deviations, strict=True):
         cells = (f"<td>{value:.4g} ± {deviation:.2g}</td>" for value, deviation in zip(values, deviations, strict=True))
-        rows.append(f"<tr><th>{html.escape(printable(name))}</th>{''.join(cells)}</tr>")
+        rows.append(f"<tr><th>{html.escape(make_printable(name))}</th>{''.join(cells)}</tr>")
     return f"<table>{''.join(rows)}</table>"

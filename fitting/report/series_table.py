@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxsubdiv as js
-from jaxsubdiv.files import replacing
+from jaxsubdiv.files import replace_file
 
 from ..model.unknowns import Layout, Variables
 from .measures import Column, Measures, Walls
@@ -55,7 +55,7 @@ class SeriesTable:
     def write_csv(self, path: str | os.PathLike[str]) -> None:
         """Write a line a frame: every measure, with its unit in the header, and its standard deviation."""
         heads = [head for name, unit in self.columns for head in (f"{name} [{unit}]", f"{name} sd [{unit}]")]
-        with replacing(path) as there, there.open("w", newline="", encoding="utf-8") as file:
+        with replace_file(path) as there, there.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(["frame", *heads])
             for name, values, deviations in zip(self.names, self.values, self.deviations, strict=True):
@@ -100,7 +100,7 @@ def measure_series(
         moved = own.retract(y, own.split(vector), edge)
         return js.refine(fit.model.scheme_at(moved), topology, moved.control)
 
-    def of_frame(vector: Float[Array, "n"], y: Variables, walls: list[Walls]) -> Float[Array, "m"]:
+    def measure_frame(vector: Float[Array, "n"], y: Variables, walls: list[Walls]) -> Float[Array, "m"]:
         return measures.measure(refine(vector, y), walls)
 
     def change(both: Float[Array, "2 n"], y: Variables, first: Variables) -> Float[Array, ""]:
@@ -108,7 +108,7 @@ def measure_series(
 
     shares = measures.shares(surfaces[0])
     zero = jnp.zeros(own.n, edge.dtype)
-    value_of, derivative_of = eqx.filter_jit(of_frame), eqx.filter_jit(jax.jacrev(of_frame))
+    value_of, derivative_of = eqx.filter_jit(measure_frame), eqx.filter_jit(jax.jacrev(measure_frame))
     change_of = eqx.filter_jit(jax.value_and_grad(change))
     values, sides = [], []
     m = len(measures.columns)
@@ -136,11 +136,11 @@ def measure_series(
     ejection = {}
     for name, column in measures.volumes.items():
         at = column + (m + 1) * np.arange(n)
-        ejection[name] = _ejected(values[:, column], covariance[np.ix_(at, at)])
+        ejection[name] = _ejection_fraction(values[:, column], covariance[np.ix_(at, at)])
     return SeriesTable(tuple(names), columns, values, deviations, ejection)
 
 
-def _ejected(volumes: Float[np.ndarray, "f"], covariance: Float[np.ndarray, "f f"]) -> tuple[float, float]:
+def _ejection_fraction(volumes: Float[np.ndarray, "f"], covariance: Float[np.ndarray, "f f"]) -> tuple[float, float]:
     """The part of the largest volume that the smallest lacks, and its standard deviation."""
     most, least = int(np.argmax(volumes)), int(np.argmin(volumes))
     slope = np.zeros(len(volumes))

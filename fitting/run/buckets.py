@@ -68,7 +68,7 @@ class Kept:
         if self._writes:
             self._file(name).write_tree(tree)
 
-    def strengths(self, find: Callable[[], FromTargets]) -> FromTargets:
+    def recall_strengths(self, find: Callable[[], FromTargets]) -> FromTargets:
         """Those that a pilot finds, or found before."""
         arrays = self._file("pilot").read() if self._writes else None
         if arrays is not None:
@@ -90,7 +90,7 @@ def share_first(tree: Any) -> Any:
     return jax.tree.map(np.asarray, multihost_utils.broadcast_one_to_all(tree))
 
 
-def size_class(n_points: int) -> int:
+def find_size_class(n_points: int) -> int:
     """How many points a scan is filled up to: 1024, or the next size in steps that grow by a quarter."""
     size = _SMALLEST
     while size < n_points:
@@ -106,7 +106,7 @@ def sort_into_classes(n_points: Sequence[int]) -> list[tuple[int, list[int]]]:
     """
     classes: dict[int, list[int]] = {}
     for i, n in enumerate(n_points):
-        classes.setdefault(size_class(n), []).append(i)
+        classes.setdefault(find_size_class(n), []).append(i)
     found: list[tuple[int, list[int]]] = []
     for size, members in sorted(classes.items()):
         if found and len(found[-1][1]) < _FEW and size <= _MOST_GROWN * found[-1][0]:
@@ -150,7 +150,7 @@ def fit_in_buckets(
     def arguments(size: int, members: list[int]) -> tuple[Any, ...]:
         filled = members + members[-1:] * (n_bucket - len(members))
         rows = stack([(own[i], fill_scene(scenes[i], size, has_slices)) for i in filled])
-        return *common, _place(rows, mesh, _rows(mesh)), at_once, mesh
+        return *common, _place(rows, mesh, _divide(mesh)), at_once, mesh
 
     found: list[Any] = [None] * len(starts)
     like: dict[int, Any] = {}
@@ -194,7 +194,7 @@ def _run(solver: Sweeps, shared: Any, own: Any, at_once: int, mesh: Mesh) -> tup
 
         return lax.map(fit_one, own, batch_size=None if at_once == 1 else at_once)
 
-    rows = _rows(mesh)
+    rows = _divide(mesh)
     return jax.shard_map(fit_all, mesh=mesh, in_specs=(P(), rows), out_specs=rows, check_vma=False)(common, own)
 
 
@@ -209,7 +209,7 @@ def _describe(size: int, n: int, n_bucket: int, given: tuple[Any, ...]) -> str:
     return f"{words}, in {memory.total / 1e6:,.0f} MB of each device"
 
 
-def _rows(mesh: Mesh) -> P:
+def _divide(mesh: Mesh) -> P:
     """Subjects divided between all devices."""
     return P(mesh.axis_names)
 

@@ -93,7 +93,7 @@ def carry_landmarks(
         )
     before = js.refine(scheme, topology, control)
     at = closest_points(before, places)
-    on_template, there = _stand(before, at), _stand(result.surface, at)
+    on_template, there = _find_stand(before, at), _find_stand(result.surface, at)
     off = places - on_template.points
     _warn_of_far(names, off, float(js.edge_length(topology, control.vertices)))
     grown = float(np.sqrt(result.surface.areas().sum() / before.areas().sum()))
@@ -135,7 +135,7 @@ class _Stand(NamedTuple):
     """Rows: along the first side of the face, to the left of it, and out of the surface."""
 
 
-def _stand(surface: js.RefinedSurface, at: js.SurfacePoint) -> _Stand:
+def _find_stand(surface: js.RefinedSurface, at: js.SurfacePoint) -> _Stand:
     points, normals = (np.asarray(rows, np.float64) for rows in js.evaluate(surface, at))
     corners, _ = js.corner_weights(surface, at)
     ends = np.asarray(surface.vertices, np.float64)[np.asarray(corners)[:, :2]]

@@ -12,7 +12,7 @@ import numpy as np
 
 import jaxsubdiv as js
 from jaxsubdiv.archives import read_arrays
-from jaxsubdiv.files import replacing
+from jaxsubdiv.files import replace_file
 
 _FORMAT = 1  # of the files of a run; a new one where they, or what they are made from, come to mean something else
 _INPUT = "input "  # before the name of an input, in the file
@@ -43,7 +43,7 @@ class Checkpoint:
         except (ValueError, OSError) as error:
             raise ValueError(f"{self.path} is no checkpoint: {error}. Delete it to start anew.") from None
         marks = {name.removeprefix(_INPUT): str(arrays.pop(name)) for name in list(arrays) if name.startswith(_INPUT)}
-        others = differing(marks, self._marks)
+        others = find_differing(marks, self._marks)
         if others:
             raise ValueError(
                 f"{self.path} is of another fit, with another {', another '.join(others)}. Start with what it was "
@@ -56,7 +56,7 @@ class Checkpoint:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         whole = {name: np.asarray(value) for name, value in arrays.items() if value is not None}
         whole |= {_INPUT + name: np.asarray(mark) for name, mark in self._marks.items()}
-        with replacing(self.path) as path, open(path, "wb") as file:
+        with replace_file(self.path) as path, open(path, "wb") as file:
             np.savez(file, **whole)  # pyright: ignore[reportArgumentType]
 
     def read_tree(self, like: Any) -> Any:
@@ -76,7 +76,7 @@ class Checkpoint:
                     f"{self.path} is no checkpoint of this fit: the array 'leaf {i}' is missing, or of another shape "
                     "or kind. Delete it to start anew."
                 )
-        return jax.tree.unflatten(structure, [_as(arrays[f"leaf {i}"], leaf) for i, leaf in enumerate(leaves)])
+        return jax.tree.unflatten(structure, [_cast_like(arrays[f"leaf {i}"], leaf) for i, leaf in enumerate(leaves)])
 
     def write_tree(self, tree: Any) -> None:
         """Take the place of what was written before by the leaves of a pytree."""
@@ -96,12 +96,12 @@ def marks_of(inputs: Mapping[str, Any]) -> dict[str, str]:
     return {name: _mark(value) for name, value in inputs.items()} | {"release": f"{js.__version__} {_FORMAT}"}
 
 
-def differing(some: Mapping[str, str], others: Mapping[str, str]) -> list[str]:
+def find_differing(some: Mapping[str, str], others: Mapping[str, str]) -> list[str]:
     """Names of the inputs that two runs do not share, by their marks."""
     return [name for name in sorted(some.keys() | others) if some.get(name) != others.get(name)]
 
 
-def _as(array: np.ndarray, leaf: Any) -> Any:
+def _cast_like(array: np.ndarray, leaf: Any) -> Any:
     array = array.astype(np.asarray(leaf).dtype, copy=False)  # a damaged file may name a precision that JAX lacks
     return jnp.asarray(array) if isinstance(leaf, jax.Array) else array
 

@@ -31,7 +31,7 @@ from ..model.recipe import Settings
 from ..model.residual import Model, analyse
 from ..model.robust import AbstractLoss, geman_mcclure
 from ..model.unknowns import Free, Variables
-from ..report.cohort import Cohort, fill_rows, name_subjects
+from ..report.cohort import Cohort, name_subjects, pad_rows
 from ..report.evidence import rests_far_off
 from ..report.record import Fit, choose_faces
 from ..report.result import FitResult
@@ -154,7 +154,7 @@ def fit_cohort(
     if pilot is not None or any(one.n_strengths and one.given_strengths() is None for one in made[0][0].priors):
         say("finds the strengths of the priors by a fit of one scan")
         of_pilot = {"symmetry": partners} | settings
-        strengths = kept.strengths(lambda: take_strengths(make_pilot(scheme, topology, given, of_pilot, pilot)))
+        strengths = kept.recall_strengths(lambda: take_strengths(make_pilot(scheme, topology, given, of_pilot, pilot)))
     without = () if strengths is None or priors.bend is not None or "height" in strengths.values else ("height",)
     filled = fill_up(inputs)
     filled = made if filled is inputs else _analyse_all(scheme, topology, given, free, priors, filled)
@@ -181,7 +181,7 @@ def fit_cohort(
         kept=kept,
         on_stage=say,
     )
-    ends = [_end_of(model, scene, state) for model, scene, (_, state) in zip(models, scenes, found, strict=True)]
+    ends = [_find_ending(model, scene, state) for model, scene, (_, state) in zip(models, scenes, found, strict=True)]
     converged = np.array([bool(end == optx.RESULTS.successful) for end in ends])
     if not converged.all():
         which = np.flatnonzero(~converged)
@@ -209,7 +209,7 @@ def fit_cohort(
         rms=np.stack([state.rms for state in states]),
         robust_rms=np.stack([state.robust_rms for state in states]),
         noise=np.array([float(state.look.noise) for state in states]),
-        weights=fill_rows([np.asarray(state.look.weights) for state in states], 0.0),
+        weights=pad_rows([np.asarray(state.look.weights) for state in states], 0.0),
         scans=tuple(one.scan for one in given),
         names=tuple(named),
         failed=failed,
@@ -235,10 +235,10 @@ def find_targets(model: Model, priors: Priors, pilot: FromTargets | None) -> Fro
 def _give_each(controls: Any, scans: Sequence[Scan], landmarks: Any, boundary: Any, regions: Any) -> list[Member]:
     """What belongs to each scan, of what was given for all or for each."""
     n = len(scans)
-    controls = _one_each(controls, js.Control, n, "controls")
-    places = [None] * n if landmarks is None else _one_each(landmarks, Landmarks, n, "landmarks")
-    curves = [None] * n if boundary is None else _one_each(boundary, BoundaryCurve, n, "boundaries")
-    matches = [None] * n if regions is None else _one_each(regions, RegionMatch, n, "regions")
+    controls = _check_one_each(controls, js.Control, n, "controls")
+    places = [None] * n if landmarks is None else _check_one_each(landmarks, Landmarks, n, "landmarks")
+    curves = [None] * n if boundary is None else _check_one_each(boundary, BoundaryCurve, n, "boundaries")
+    matches = [None] * n if regions is None else _check_one_each(regions, RegionMatch, n, "regions")
     return [Member(*one) for one in zip(controls, scans, places, curves, matches, strict=True)]
 
 
@@ -281,7 +281,7 @@ def _analyse_all(
     return made
 
 
-def _end_of(model: Model, scene: Scene, state: State) -> optx.RESULTS:
+def _find_ending(model: Model, scene: Scene, state: State) -> optx.RESULTS:
     """Why a subject's fit ended. One that nothing moved from far off has come to rest, and has not converged."""
     if state.status != CONVERGED:
         return optx.RESULTS.nonfinite if state.status == NONFINITE else optx.RESULTS.nonlinear_max_steps_reached
@@ -290,7 +290,7 @@ def _end_of(model: Model, scene: Scene, state: State) -> optx.RESULTS:
     return optx.RESULTS.successful
 
 
-def _one_each(given: _T | Sequence[_T], kind: type, n: int, name: str) -> list[_T]:
+def _check_one_each(given: _T | Sequence[_T], kind: type, n: int, name: str) -> list[_T]:
     """One for each scan."""
     values = [given] * n if isinstance(given, kind) else list(given)  # pyright: ignore[reportArgumentType]
     if len(values) != n or not n:

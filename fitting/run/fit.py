@@ -21,7 +21,7 @@ from ..finding import Origin
 from ..model.limits import check_numbers
 from ..model.pairing import Scene, make_scene
 from ..model.priors import Priors
-from ..model.priors.boundary import BoundaryCurve, checked_curve
+from ..model.priors.boundary import BoundaryCurve, check_curve
 from ..model.priors.landmarks import anchor_landmarks
 from ..model.priors.shifts import find_slice_planes
 from ..model.priors.symmetry import Symmetry, find_symmetry, symmetry_of
@@ -40,7 +40,7 @@ from ..solve.sparse_normal import SparseNormal
 from ..solve.strengths import FromScan, first_strengths
 from ..solve.structure import find_structure
 from ..solve.sweeps import State, Subject, Sweeps, hold_priors, subject_residual
-from ..start.folds import Folds, unfolded_start
+from ..start.folds import Folds, unfold_start
 from .checkpoint import Checkpoint
 from .sizes import check_sizes
 
@@ -266,7 +266,7 @@ def gather_inputs(
         "landmarks": None
         if landmarks is None
         else anchor_landmarks(landmarks, landmark_deviation, topology, control, surface),
-        "boundary": None if boundary is None else checked_curve(boundary, topology),
+        "boundary": None if boundary is None else check_curve(boundary, topology),
         "slices": find_slice_planes(scan) if free.shifts else None,
     }
 
@@ -330,7 +330,7 @@ def find_partners(
 def sound_start(scheme: js.AbstractScheme, topology: js.Topology, control: js.Control, free: Free) -> js.Control:
     """The control mesh without faces upside down, with unit normals that fold nothing."""
     may_move = free.masks(scheme, topology.n_control_vertices)["vertices"]
-    control = unfolded_start(topology, control, may_move)
+    control = unfold_start(topology, control, may_move)
     return js.Control(control.vertices, given_normals(topology, control))
 
 

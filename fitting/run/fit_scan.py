@@ -25,7 +25,7 @@ from ..scan.closest_points import closest_points, nearest_rows
 from ..scan.landmarks import Landmarks
 from ..scan.regions import Groups, match_regions
 from ..scan.scan import Scan
-from ..start.align import Alignment, Kind, align, mirror_image, put
+from ..start.align import Alignment, Kind, align, mirror_image, place_mesh
 from ..start.control_mesh import FaceKind, make_control_mesh
 from ..start.family import flat_surface, place_member
 from ..start.parts import PartKind
@@ -163,7 +163,7 @@ def fit_scan(
     if before is not None:
         say("goes on where it was stopped")
         try:
-            start = _recalled(before, first, mesh)
+            start = _restore_start(before, first, mesh)
         except (KeyError, ValueError, TypeError) as error:
             where = Path(checkpoint or "") / CHECKPOINT_START
             raise ValueError(f"{where} is no checkpoint of a start: {error}. Delete it to start anew.") from None
@@ -171,7 +171,7 @@ def fit_scan(
         say(f"makes a control mesh of about {faces} faces")
         made = make_control_mesh(scan, faces=faces, kind=kind, closed=closed, part=part)
         origin = Origin(None, made.findings)
-        mesh_made = made.mesh.triangulated() if first.takes == (3,) else made.mesh
+        mesh_made = made.mesh.triangulate() if first.takes == (3,) else made.mesh
         start = _Start(mesh_made, first, None, 0, origin, shown=None if made.shown.all() else made.shown)
     elif pose is not None:
         say("aligns the control mesh with the scan")
@@ -185,7 +185,7 @@ def fit_scan(
         start = _Start(mesh, first, None, 0, Origin())
     own_partners = options.pop("symmetry", None)
     whole = scan if start.shown is None else scan.rows(start.shown)
-    scan = whole if most_points is None else whole.drawn(most_points)
+    scan = whole if most_points is None else whole.draw(most_points)
     while True:
         # Tables come from the faces alone; normals that would fold the surface are replaced in the fit.
         bare = js.ControlMesh(start.mesh.vertices, start.mesh.faces)
@@ -197,7 +197,7 @@ def fit_scan(
             check(start.scheme, topology, control, scan)  # what cannot be fitted leaves no file
             kept.write(_arrays(start))
         # The landmarks' places were those of the template.
-        of_first = _landmarks_there(landmarks, mesh, start) if start.splits == 0 else None
+        of_first = _place_landmarks(landmarks, mesh, start) if start.splits == 0 else None
         partners = own_partners if start.splits == 0 else None
         if partners is None and mesh is not None and np.isfinite(priors.symmetry):
             partners = _partners(mesh, first, start.splits)
@@ -226,7 +226,7 @@ def fit_scan(
         kept.remove()
     if scan is not whole:
         say(f"measures all {whole.n_points:,} points")
-        result = result.on(whole)
+        result = result.compare_with(whole)
     recipe = dataclasses.replace(result.recipe, scheme=first, priors=priors, **settings)
     result = FitResult(dataclasses.replace(result.fit, origin=start.origin), recipe=recipe)
     return ScanFit(result, start.mesh, start.alignment, start.splits, outcome)
@@ -246,10 +246,10 @@ def _partners(template: js.ControlMesh, scheme: js.AbstractScheme, splits: int) 
     return find_symmetry(template)
 
 
-def _landmarks_there(landmarks: Landmarks | None, mesh: js.ControlMesh | None, start: _Start) -> Landmarks | None:
+def _place_landmarks(landmarks: Landmarks | None, mesh: js.ControlMesh | None, start: _Start) -> Landmarks | None:
     if landmarks is None or mesh is None or start.alignment is None:
         return landmarks
-    there = moved(landmarks, mesh, start.alignment)
+    there = move_landmarks(landmarks, mesh, start.alignment)
     if start.mesh is start.alignment.mesh or np.ndim(there.on_mesh) == 1:
         return there
     # The mesh has another shape there: on its faces landmarks keep their places.
@@ -279,7 +279,7 @@ def _arrays(start: _Start) -> dict[str, Any]:
     return arrays | {"transform": alignment.transform, "rms": alignment.rms, "share": alignment.share}
 
 
-def _recalled(arrays: dict[str, np.ndarray], scheme: js.AbstractScheme, template: js.ControlMesh | None) -> _Start:
+def _restore_start(arrays: dict[str, np.ndarray], scheme: js.AbstractScheme, template: js.ControlMesh | None) -> _Start:
     faces, regions = {3: arrays["triangles"], 4: arrays["quads"]}, None
     if template is not None and template.regions is not None:
         regions = js.Regions(arrays["regions"], template.regions.names)
@@ -289,7 +289,7 @@ def _recalled(arrays: dict[str, np.ndarray], scheme: js.AbstractScheme, template
     alignment, origin = None, Origin.from_json(str(arrays["origin"]))
     if template is not None and "transform" in arrays and origin.pose is not None:
         numbers = float(arrays["rms"]), float(arrays["share"])
-        there = put(template, arrays["transform"])
+        there = place_mesh(template, arrays["transform"])
         alignment = Alignment(arrays["transform"], there, *numbers, origin.findings, origin.pose)
     return _Start(mesh, scheme, alignment, int(arrays["splits"]), origin, arrays.get("unseen"), arrays.get("shown"))
 
@@ -339,10 +339,10 @@ def split(scheme: js.AbstractScheme, mesh: js.ControlMesh, control: js.Control) 
 def first_control(mesh: js.ControlMesh, scheme: js.AbstractScheme) -> js.Control:
     """The control that a fit of a mesh starts from: the surface goes, nearly, through the vertices of the mesh."""
     control = mesh.control(weights=scheme.weights)
-    return control if scheme.interpolates else js.Control(_swollen(mesh, scheme), control.normals)
+    return control if scheme.interpolates else js.Control(_swell(mesh, scheme), control.normals)
 
 
-def _swollen(mesh: js.ControlMesh, scheme: js.AbstractScheme) -> Float[np.ndarray, "v 3"]:
+def _swell(mesh: js.ControlMesh, scheme: js.AbstractScheme) -> Float[np.ndarray, "v 3"]:
     """Control vertices whose limit surface, which shrinks from them, goes nearly through those of the mesh."""
     bare = js.ControlMesh(mesh.vertices, mesh.faces)
     limit = js.stencils(scheme, js.build_topology(bare, scheme, 0, limit=True))[: len(mesh.vertices)]
@@ -352,7 +352,7 @@ def _swollen(mesh: js.ControlMesh, scheme: js.AbstractScheme) -> Float[np.ndarra
     return vertices
 
 
-def moved(landmarks: Landmarks, mesh: js.ControlMesh, alignment: Alignment) -> Landmarks:
+def move_landmarks(landmarks: Landmarks, mesh: js.ControlMesh, alignment: Alignment) -> Landmarks:
     """Landmarks whose places on the template moved along with it."""
     on_mesh = np.asarray(landmarks.on_mesh)
     if on_mesh.ndim == 1:

@@ -21,6 +21,7 @@ FIT = "fit.npz"
 """What `fitting.load` reads; it is put in place after all other files."""
 LANDMARKS, CARRIED = "landmarks.mrk.json", "landmarks.csv"
 """Landmarks that were carried to the fit, for 3D Slicer and as a table; beside the summary, a table of those of all."""
+TETRAHEDRA, PATCHES = "tetrahedra.vtu", ("patches.vtu", "patches.xml")
 TABLE_OF_SERIES, PAGE_OF_SERIES, NAMES_OF_SERIES = "series.csv", "series.html", "series.json"
 ANIMATION = "series.gif"
 FRAMES = "frames"
@@ -28,18 +29,26 @@ FRAMES = "frames"
 RESULTS = ("control.obj", "surface.ply", "report.json", "fit.html", "recipe.json", "fit.png", FIT)
 """Of a fit without options."""
 _SERIES = (TABLE_OF_SERIES, PAGE_OF_SERIES, NAMES_OF_SERIES, ANIMATION)
-_PLACED = (*SURFACE_FILES, LANDMARKS, CARRIED, *_SERIES, *(name for name in RESULTS if name not in SURFACE_FILES))
-_UNFINISHED = ".unfinished-"  # the folders of `jaxsubdiv.files.replacing` and of `fill`
+_EXPORTS = (TETRAHEDRA, *PATCHES)
+_PLACED = (
+    *SURFACE_FILES,
+    *_EXPORTS,
+    LANDMARKS,
+    CARRIED,
+    *_SERIES,
+    *(name for name in RESULTS if name not in SURFACE_FILES),
+)
+_UNFINISHED = ".unfinished-"  # the folders of `jaxsubdiv.files.replace_file` and of `fill_folder`
 _OURS = {*_PLACED, CHECKPOINT, CHECKPOINT_START, SUMMARY}
 
 
-def results_in(folder: Path) -> set[str]:
+def find_results(folder: Path) -> set[str]:
     """Names of files that are results where they lie in this folder: of a fit only if it holds one, whole or not."""
     return _OURS if (folder / FIT).exists() or is_unfinished(folder) else {SUMMARY, CARRIED}
 
 
 @contextmanager
-def working_in(folder: Path) -> Iterator[None]:
+def reserve_folder(folder: Path) -> Iterator[None]:
     """Make a folder, see that it can be written, keep other runs out of it, and clean up what killed ones left.
 
     Folders that were made and are empty at the end go again.
@@ -51,7 +60,7 @@ def working_in(folder: Path) -> Iterator[None]:
     made = [one for one in (folder, *folder.parents) if not one.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        with _locked(folder):
+        with _lock(folder):
             _clean(folder)
             with tempfile.TemporaryFile(dir=folder):
                 pass
@@ -63,7 +72,7 @@ def working_in(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def _lock(folder: Path) -> Iterator[None]:
     """The system lets go of the folder when the process ends, in whatever way."""
     if fcntl is None:
         yield
@@ -101,7 +110,7 @@ def is_unfinished(folder: Path) -> bool:
 
 
 @contextmanager
-def filling(folder: Path) -> Iterator[Path]:
+def fill_folder(folder: Path) -> Iterator[Path]:
     """A folder to write the files of a fit to; they take their places together once the block is left without an error.
 
     The checkpoint, which marks the folder as unfinished, goes last. What an earlier fit left and this one did not write

@@ -8,7 +8,7 @@ from itertools import count
 from pathlib import Path
 
 from ..image.read import is_image, stem
-from .folder import CARRIED, SUMMARY, results_in
+from .folder import CARRIED, SUMMARY, find_results
 
 _SCAN_FILES = {".ply", ".xyz", ".csv", ".txt", ".npz", ".vtp", ".vtk", ".stl", ".obj", ".off", ".gii"}
 _SCAN_FILES |= {".vtu", ".glb", ".pcd", ".pts", ".hsp"}
@@ -28,7 +28,7 @@ def find_scans(given: Sequence[Path]) -> list[Path]:
         if not path.is_dir():
             scans.append(path)
             continue
-        results = results_in(path)
+        results = find_results(path)
         inside = sorted(file for file in path.iterdir() if _is_scan(file) and file.name.lower() not in results)
         if not inside:
             raise ValueError(f"the folder {path} holds no scan: {', '.join(sorted(_SCAN_FILES))}.")
@@ -54,7 +54,7 @@ def name_folders(scans: Sequence[Path]) -> list[str]:
         more = [
             i
             for i, name in enumerate(names)
-            if steps[i] < len(choices[i]) - 1 and (counts[_key(name)] > 1 or _bad(name))
+            if steps[i] < len(choices[i]) - 1 and (counts[_key(name)] > 1 or _is_bad(name))
         ]
         if not more:
             return _number(names)
@@ -80,7 +80,7 @@ def _key(name: str) -> str:
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold()).rstrip(". ")
 
 
-def _bad(name: str) -> bool:
+def _is_bad(name: str) -> bool:
     """Whether a folder cannot have the name, as `..`, or not beside the tables of all."""
     return _key(name) in ("", SUMMARY, CARRIED) or len(os.fsencode(name)) > _LONGEST
 
@@ -89,7 +89,7 @@ def _number(names: list[str]) -> list[str]:
     taken, found = {_key(name) for name in names}, []
     seen: set[str] = set()
     for name in names:
-        if _key(name) in seen or _bad(name):
+        if _key(name) in seen or _is_bad(name):
             short = os.fsencode(name)[:_LONGEST].decode("utf-8", "ignore")
             name = next(new for i in count(2) if _key(new := f"{short}-{i}") not in taken)
             taken.add(_key(name))

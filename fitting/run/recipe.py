@@ -64,7 +64,7 @@ def load_recipe(path: str | os.PathLike[str]) -> Recipe:
         raise ValueError(f"{path}: {error}") from None
 
 
-def _with_recipe(result: FitResult) -> FitResult:
+def _add_recipe(result: FitResult) -> FitResult:
     """The result with settings that can fit the next scan."""
     settings = result.recipe
     result.recipe = Recipe(**{field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)})
@@ -73,13 +73,13 @@ def _with_recipe(result: FitResult) -> FitResult:
 
 @functools.wraps(_fit.fit)
 def fit(*arguments: Any, **options: Any) -> FitResult:
-    return _with_recipe(_fit.fit(*arguments, **options))
+    return _add_recipe(_fit.fit(*arguments, **options))
 
 
 @functools.wraps(_fit_scan.fit_scan)
 def fit_scan(*arguments: Any, **options: Any) -> ScanFit:
     found = _fit_scan.fit_scan(*arguments, **options)
-    return found._replace(result=_with_recipe(found.result))
+    return found._replace(result=_add_recipe(found.result))
 
 
 def load(folder: str | os.PathLike[str]) -> FitResult:

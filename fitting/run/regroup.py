@@ -85,7 +85,7 @@ def regroup(
         controls = [_control(scheme, topology, align_shape(mean, shape), dtype) for shape in shapes]
         here = dict(own)
         if first.inputs.get("landmarks") is not None:
-            here["landmarks"] = [_landmarks_on(*one, told) for one in zip(fits, controls, strict=True)]
+            here["landmarks"] = [_carry_landmarks(*one, told) for one in zip(fits, controls, strict=True)]
         cohort = fit_cohort(scheme, topology, controls, cohort.scans, **(here | options))
         last, mean = mean, _mean_shape(cohort, symmetry)
         moved.append(_distance(scheme, topology, last, mean, dtype))
@@ -100,7 +100,7 @@ def regroup(
 def _mean_shape(cohort: Cohort, symmetry: Symmetry | None) -> Float[np.ndarray, "v 3"]:
     shapes = np.asarray(cohort.control.vertices, np.float64)
     mean = shape_modes(shapes).mean if len(shapes) > 1 else shapes[0]
-    return mean if symmetry is None else 0.5 * (mean + symmetry.mirrored(mean))
+    return mean if symmetry is None else 0.5 * (mean + symmetry.mirror(mean))
 
 
 def _control(scheme: js.AbstractScheme, topology: js.Topology, vertices: np.ndarray, dtype: Any) -> js.Control:
@@ -108,7 +108,7 @@ def _control(scheme: js.AbstractScheme, topology: js.Topology, vertices: np.ndar
     return js.Control(placed, js.estimate_normals(topology.control_fans, placed))
 
 
-def _landmarks_on(found: Fit, control: js.Control, told: Any) -> Landmarks:
+def _carry_landmarks(found: Fit, control: js.Control, told: Any) -> Landmarks:
     """The landmarks of a fit at the same places of the surface, where that starts now."""
     anchors = found.inputs["landmarks"]
     surface = js.refine(told.scheme, found.topology, control)

@@ -143,13 +143,13 @@ def fit_series(
     whole = copy_mesh(mesh, frames)
     tables = js.build_topology(js.ControlMesh(whole.vertices, whole.faces), scheme, levels)
     placed = first_control(mesh, scheme)
-    control = js.Control(jnp.asarray(frames.copies(np.asarray(placed.vertices))), jnp.tile(placed.normals, (n, 1)))
+    control = js.Control(jnp.asarray(frames.copy_rows(np.asarray(placed.vertices))), jnp.tile(placed.normals, (n, 1)))
     check(scheme, tables, control, scan)
     control = sound_start(scheme, tables, control, free)
     inputs = gather_inputs(scheme, tables, control, scan, free, None, 1.0, None)
     match = match_regions(scan, whole, regions)
     inputs |= {"regions": match, "frames": frames}
-    inputs["slices"] = find_slice_planes(frames.in_place(scan)) if free.shifts else None
+    inputs["slices"] = find_slice_planes(frames.place_back(scan)) if free.shifts else None
     inputs["valves"], scan = _take_valve_points(scan, mesh, match, valves, valve_deviation, inputs["slices"], n)
     model, y = analyse(scheme, tables, control, free, priors, inputs)
     y = _start_at(first, y, frames)
@@ -232,15 +232,15 @@ def _take_valve_points(
         return None, scan
     region = np.array(mesh.regions.words() if mesh.regions is not None else [])
 
-    def copied(faces: Bool[np.ndarray, "f"]) -> Bool[np.ndarray, "g"]:
+    def copy_faces(faces: Bool[np.ndarray, "f"]) -> Bool[np.ndarray, "g"]:
         return copies_of_faces(faces, mesh.faces[3], n)
 
     given = ValvePoints(
         np.asarray(scan.points, np.float64)[rows],
         (np.full(scan.n_points, -1) if planes is None else planes.rows_of(scan))[rows],
         np.array([names.index(valve_of[word]) for word, is_valve in zip(words, rows, strict=True) if is_valve]),
-        np.stack([copied(region == name) for name in names]),
-        copied(np.any([part.faces for part in beside], axis=0)),
+        np.stack([copy_faces(region == name) for name in names]),
+        copy_faces(np.any([part.faces for part in beside], axis=0)),
         deviation,
     )
     weights = np.where(rows, 0.0, np.asarray(scan.weights_or_ones()))
@@ -254,7 +254,7 @@ def _start_at(first: dict[str, Any], y: Variables, frames: Frames) -> Variables:
     """
     normals = jnp.tile(jnp.asarray(first["normals"]), (len(frames.counts), 1))
     shared = {name: jnp.asarray(first["h"]) if name == "h" else value for name, value in y.shared.items()}
-    return Variables(js.Control(jnp.asarray(frames.copies(first["vertices"])), normals), shared)
+    return Variables(js.Control(jnp.asarray(frames.copy_rows(first["vertices"])), normals), shared)
 
 
 def _common_motion(result: FitResult) -> Float[np.ndarray, "3"]:

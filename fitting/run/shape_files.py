@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 import jaxsubdiv as js
-from jaxsubdiv.files import replacing
+from jaxsubdiv.files import replace_file
 
 from ..model.groups import GroupDifference
 from ..model.mode_quality import ModeQuality
@@ -80,7 +80,7 @@ def write_shapes(
         arrays |= {"landmark_names": np.array(landmarks[0].names), "landmarks": np.stack([m.points for m in landmarks])}
         _write_landmarks(folder, cohort, landmarks)
     as_numpy: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
-    with replacing(folder / "shapes.npz") as path:
+    with replace_file(folder / "shapes.npz") as path:
         np.savez(path, **as_numpy)
 
 
@@ -135,7 +135,7 @@ def _write_landmarks(folder: Path, cohort: Cohort, landmarks: Sequence[CarriedLa
 
 
 def _write_table(path: Path, columns: list[str], rows: list[list]) -> None:
-    with replacing(path) as unfinished, unfinished.open("w", encoding="utf-8", newline="") as file:
+    with replace_file(path) as unfinished, unfinished.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows(rows)

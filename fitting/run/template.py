@@ -16,7 +16,7 @@ from ..start.align import align
 from ..start.control_mesh import FaceKind, control_mesh
 from ..start.symmetric_mesh import make_symmetric
 from .cohort import fit_cohort
-from .fit_scan import first_control, moved
+from .fit_scan import first_control, move_landmarks
 from .regroup import Template, regroup
 
 
@@ -60,14 +60,14 @@ def make_template(
     scheme = scheme or js.Interpolating()
     say(f"makes a control mesh of scan {first}")
     mesh = control_mesh(scans[first], faces=faces, kind="triangle" if symmetric else kind, closed=closed)
-    mesh = make_symmetric(mesh) if symmetric else mesh.triangulated() if scheme.takes == (3,) else mesh
+    mesh = make_symmetric(mesh) if symmetric else mesh.triangulate() if scheme.takes == (3,) else mesh
     partners = find_symmetry(mesh) if symmetric else None
     topology = js.build_topology(js.ControlMesh(mesh.vertices, mesh.faces), scheme, levels)
     places = None if landmarks is None else [match_landmarks(own, landmarks[first]) for own in landmarks]
     say(f"aligns it with {len(scans)} scans")
     found = [align(mesh, scan, landmarks=None if places is None else places[i]) for i, scan in enumerate(scans)]
     if places is not None:
-        places = [moved(own, mesh, one) for own, one in zip(places, found, strict=True)]
+        places = [move_landmarks(own, mesh, one) for own, one in zip(places, found, strict=True)]
     say("fits all")
     priors = options.pop("priors", None) or Priors()
     # Made from the first scan, the control mesh has its noise: that is not expected of any.

@@ -145,15 +145,15 @@ class _Search:
 
     def usual_distance(self) -> float:
         """How far most points are from the surface at most, by a few of them."""
-        rows = _some(np.arange(len(self._rows)))
-        distances = self._bounds_by(rows, np.asarray(self._tree.query(self._rows[rows])[1]))
+        rows = _take_sample(np.arange(len(self._rows)))
+        distances = self._bound(rows, np.asarray(self._tree.query(self._rows[rows])[1]))
         most, half = np.quantile(distances, (0.85, 0.5))
         return float(np.clip(1.5 * most, 0.02 * self._reach, max(2 * self._reach, 1.5 * half)))  # not for outliers
 
     def look_around(self, rows: Int[np.ndarray, "r"]) -> None:
         """Find what is nearest to points that may be far away: those about as far together."""
-        for lost in _in_parts(rows[np.isinf(self._bounds[rows])], 1.0):
-            self._bounds[lost] = self._bounds_by(lost, nearest_rows(self._tree, self._rows[lost], 1)[1][:, 0])
+        for lost in _split_into_parts(rows[np.isinf(self._bounds[rows])], 1.0):
+            self._bounds[lost] = self._bound(lost, nearest_rows(self._tree, self._rows[lost], 1)[1][:, 0])
         shells = np.floor(np.log1p(_SHELL * self._bounds[rows] / max(self._reach, _TINY)) / np.log1p(_SHELL))
         for shell in np.unique(shells):
             alike = rows[shells == shell]
@@ -163,9 +163,9 @@ class _Search:
         """Find what is nearest to the points that are no farther than `within` from the surface."""
         pairs = float(len(self._groups.radii))
         if len(rows) * pairs > _PAIRS_AT_ONCE:
-            few = self._rows[_some(rows)]
+            few = self._rows[_take_sample(rows)]
             pairs = float(self._tree.query_ball_point(few, within + self._reach, return_length=True).mean())
-        for part in _in_parts(rows, pairs):
+        for part in _split_into_parts(rows, pairs):
             self._look(part, within)
 
     def _look(self, rows: Int[np.ndarray, "r"], within: float) -> None:
@@ -179,14 +179,14 @@ class _Search:
         first[point[nearest]] = group[nearest]
         reached = np.flatnonzero(first >= 0)
         row = rows[reached]
-        self._bounds[row] = np.minimum(self._bounds[row], self._bounds_by(row, first[reached]))
+        self._bounds[row] = np.minimum(self._bounds[row], self._bound(row, first[reached]))
         sure = self._bounds[rows] <= within
         self.found[rows[sure]] = True
         bound = np.where(sure, self._bounds[rows], -np.inf)[point]
         pair = np.flatnonzero(to_centre <= bound + self._groups.radii[group])
-        self._decide(*self._within(rows[point[pair]], group[pair], bound[pair]))
+        self._decide(*self._find_within(rows[point[pair]], group[pair], bound[pair]))
 
-    def _bounds_by(self, rows: Int[np.ndarray, "r"], groups: Int[np.ndarray, "r"]) -> Float[np.ndarray, "r"]:
+    def _bound(self, rows: Int[np.ndarray, "r"], groups: Int[np.ndarray, "r"]) -> Float[np.ndarray, "r"]:
         """Distances of points from a triangle of a group each, a little more."""
         balls = np.take(self._groups.balls, groups, axis=1).reshape(_GROUP, 4, -1)
         away = balls[:, :3] - np.take(self._points, rows, axis=1)
@@ -194,7 +194,7 @@ class _Search:
         distances = self._measure(rows, self._groups.triangles[member, groups])[0]
         return distances * (1 + _SLACK) + 100 * self._rounding[rows]
 
-    def _within(
+    def _find_within(
         self, rows: Int[np.ndarray, "k"], groups: Int[np.ndarray, "k"], bounds: Float[np.ndarray, "k"]
     ) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"]]:
         """Points and triangles: those of the groups that may lie within the bounds."""
@@ -246,11 +246,11 @@ def _tree(points: Float[np.ndarray, "c 3"]) -> KDTree:
     return KDTree(points, leafsize=16, balanced_tree=False)  # built faster, and searched as fast
 
 
-def _some(rows: Int[np.ndarray, "r"]) -> Int[np.ndarray, "s"]:
+def _take_sample(rows: Int[np.ndarray, "r"]) -> Int[np.ndarray, "s"]:
     return rows[np.linspace(0, len(rows) - 1, min(len(rows), _SAMPLE)).astype(int)]
 
 
-def _in_parts(rows: Int[np.ndarray, "r"], pairs: float) -> list[Int[np.ndarray, "s"]]:
+def _split_into_parts(rows: Int[np.ndarray, "r"], pairs: float) -> list[Int[np.ndarray, "s"]]:
     """Rows in parts of `_PAIRS_AT_ONCE`, where each has so many pairs."""
     parts = min(int(np.ceil(len(rows) * pairs / _PAIRS_AT_ONCE)), len(rows))
     return np.array_split(rows, max(parts, 1)) if len(rows) else []

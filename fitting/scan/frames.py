@@ -46,12 +46,12 @@ class Frames(NamedTuple):
         end = int(self.counts[: frame + 1].sum())
         return slice(end - int(self.counts[frame]), end)
 
-    def in_place(self, scan: Scan) -> Scan:
+    def place_back(self, scan: Scan) -> Scan:
         """The points of all frames where they were measured, with their weights and slices."""
         back = jnp.asarray(self.offsets[self.of_points], scan.points.dtype)
         return Scan(scan.points - back, weights=scan.weights, slices=scan.slices)
 
-    def copies(self, rows: AnyArray) -> AnyArray:
+    def copy_rows(self, rows: AnyArray) -> AnyArray:
         """Positions `[v, 3]` once for every frame, placed there."""
         dtype = rows.dtype
         return (rows[None] + self.offsets[:, None].astype(dtype)).reshape(-1, 3)
@@ -93,7 +93,7 @@ def copy_mesh(mesh: js.ControlMesh, frames: Frames) -> js.ControlMesh:
     regions = None
     if mesh.regions is not None:
         regions = js.Regions(copies_of_faces(mesh.regions.rows, mesh.faces[3], n), mesh.regions.names)
-    return js.ControlMesh(frames.copies(mesh.vertices), faces, normals, regions=regions)
+    return js.ControlMesh(frames.copy_rows(mesh.vertices), faces, normals, regions=regions)
 
 
 def copies_of_faces(rows: AnyArray, triangles: Int[AnyArray, "t 3"], n: int) -> AnyArray:

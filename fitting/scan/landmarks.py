@@ -11,8 +11,8 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 import jaxsubdiv as js
-from jaxsubdiv.files import replacing
-from jaxsubdiv.frames import AXES, Frame, in_frame
+from jaxsubdiv.files import replace_file
+from jaxsubdiv.frames import AXES, Frame, convert_frame
 from jaxsubdiv.markups import read_control_points, write_control_points
 from jaxsubdiv.notices import warn
 from jaxsubdiv.tables import decode
@@ -110,7 +110,7 @@ def read_framed_landmarks(path: str | Path, *, scale: float = 1.0, frame: Frame 
             f"{path.name}: positions are in {own} ({AXES[own]}), as the file says; scan and template must be in it too."
         )
     if own is not None and frame is not None:
-        landmarks = {name: in_frame(position, own, frame) for name, position in landmarks.items()}
+        landmarks = {name: convert_frame(position, own, frame) for name, position in landmarks.items()}
     return FramedLandmarks(landmarks, frame or own)
 
 
@@ -146,7 +146,7 @@ def write_landmarks(
         raise ScanError(f"{path}: the landmarks {', '.join(bad)} are not three finite numbers x, y, z.")
     spread = None if deviations is None else np.array([deviations[name] for name in positions], np.float64)
     rows = np.array(list(positions.values())).reshape(-1, 3)
-    with replacing(path) as unfinished:
+    with replace_file(path) as unfinished:
         write_control_points(unfinished, rows, list(positions), frame=frame, deviations=spread)
 
 

@@ -24,13 +24,13 @@ def choose_outside(scan: Scan) -> Scan:
     Raises:
         ScanError: the scan has neither normals nor faces, or hardly a point is seen: its normals may point inward.
     """
-    points, normals = np.asarray(scan.points, np.float64), _normals(scan)
+    points, normals = np.asarray(scan.points, np.float64), _find_normals(scan)
     some = points if len(points) <= _SAMPLE else points[np.random.default_rng(0).choice(len(points), _SAMPLE, False)]
     apart = KDTree(points).query(some, k=min(3, len(points)))[0][:, -1]  # one of two nearest may be a repeated point
     cell = _CELL * max(float(np.median(apart)), 1e-9 * float(np.ptp(points, axis=0).max()))
     seen = np.zeros(len(points), int)
-    for view in _directions():
-        seen += (normals @ view > _LEAST_COSINE) & _foremost(points, view, cell)
+    for view in _spread_views():
+        seen += (normals @ view > _LEAST_COSINE) & _find_foremost(points, view, cell)
     chosen = seen >= _LEAST_VIEWS
     if chosen.mean() < 0.01:
         raise ScanError(
@@ -39,7 +39,7 @@ def choose_outside(scan: Scan) -> Scan:
     return scan.rows(chosen)
 
 
-def _normals(scan: Scan) -> Float[np.ndarray, "p 3"]:
+def _find_normals(scan: Scan) -> Float[np.ndarray, "p 3"]:
     if scan.normals is not None:
         normals = np.asarray(scan.normals, np.float64)
     elif scan.faces is not None:
@@ -52,7 +52,7 @@ def _normals(scan: Scan) -> Float[np.ndarray, "p 3"]:
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
 
 
-def _directions() -> Float[np.ndarray, "d 3"]:
+def _spread_views() -> Float[np.ndarray, "d 3"]:
     """Spread evenly over the sphere, along a spiral."""
     k = np.arange(_VIEWS)
     z, turn = 1 - 2 * (k + 0.5) / _VIEWS, np.pi * (3 - 5**0.5) * k
@@ -60,7 +60,9 @@ def _directions() -> Float[np.ndarray, "d 3"]:
     return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
 
 
-def _foremost(points: Float[np.ndarray, "p 3"], view: Float[np.ndarray, "3"], cell: float) -> Bool[np.ndarray, "p"]:
+def _find_foremost(
+    points: Float[np.ndarray, "p 3"], view: Float[np.ndarray, "3"], cell: float
+) -> Bool[np.ndarray, "p"]:
     """Whether no other point lies before a point, in its cell of the view."""
     aside = np.cross(view, np.eye(3)[int(np.argmin(np.abs(view)))])
     aside /= np.linalg.norm(aside)

@@ -38,7 +38,7 @@ class RegionMatch(eqx.Module):
             if lost or not groups:
                 raise ValueError(
                     f"the label '{label}' is to lie on {', '.join(map(repr, lost)) or 'no region'}, but the control "
-                    f"faces lie in {_listed(known)}."
+                    f"faces lie in {_list_names(known)}."
                 )
 
     @property
@@ -92,11 +92,11 @@ def match_regions(scan: Scan, mesh: js.ControlMesh, groups: Groups | None = None
         if groups:
             raise ValueError("`regions` name groups of the control mesh, and it has none. An OBJ file has them as `g`.")
         return None
-    given = _given(groups or {}, mesh.regions)
+    given = _normalise_groups(groups or {}, mesh.regions)
     labels = () if scan.regions is None else scan.regions.names
     if groups and not labels:
         raise ScanError(
-            f"`regions` are given for {_listed(groups)}, but the scan has no labels. A table has them in a column "
+            f"`regions` are given for {_list_names(groups)}, but the scan has no labels. A table has them in a column "
             "`label` or `contour`."
         )
     counts = dict(zip(mesh.regions.names, mesh.regions.counts(), strict=True))
@@ -129,7 +129,7 @@ def _are_words(value: object) -> bool:
     return isinstance(value, list) and all(isinstance(word, str) for word in value)
 
 
-def _given(groups: Groups, regions: js.Regions) -> dict[str, tuple[str, ...]]:
+def _normalise_groups(groups: Groups, regions: js.Regions) -> dict[str, tuple[str, ...]]:
     """The groups of labels in small letters, by the names that the mesh has for them."""
     known, found = {name.casefold(): name for name in regions.names}, {}
     for label, names in groups.items():
@@ -138,7 +138,7 @@ def _given(groups: Groups, regions: js.Regions) -> dict[str, tuple[str, ...]]:
         if lost:
             raise ValueError(
                 f"`regions` put '{label}' on '{lost[0]}', which is no group of the control mesh. It has "
-                f"{_listed(regions.names)}."
+                f"{_list_names(regions.names)}."
             )
         wanted = {known[name.casefold()] for name in names}
         found[label.casefold()] = tuple(name for name in regions.names if name in wanted)
@@ -152,22 +152,22 @@ def _groups_of(label: str, groups: Sequence[str]) -> tuple[str, ...]:
         return same
     words = {group: _words(group) for group in groups}
     own = _words(label)
-    within = {group: len(some) for group, some in words.items() if _holds(own, some)}
+    within = {group: len(some) for group, some in words.items() if _contains(own, some)}
     if within:
         most = max(within.values())
         return tuple(group for group, n in within.items() if n == most)
-    return tuple(group for group, some in words.items() if _holds(some, own))
+    return tuple(group for group, some in words.items() if _contains(some, own))
 
 
 def _words(name: str) -> list[str]:
     return [word for word in re.split(r"[\W_]+", name.casefold()) if word]
 
 
-def _holds(words: list[str], some: list[str]) -> bool:
+def _contains(words: list[str], some: list[str]) -> bool:
     """Whether some words, one or more, stand among others in their order, without gaps."""
     n = len(some)
     return n > 0 and any(words[i : i + n] == some for i in range(len(words) - n + 1))
 
 
-def _listed(names: object) -> str:
+def _list_names(names: object) -> str:
     return ", ".join(sorted(map(str, names))) or "none"  # pyright: ignore[reportArgumentType]

@@ -15,7 +15,7 @@ import jaxsubdiv as js
 from jaxsubdiv import strong_float
 from jaxsubdiv.errors import name_rows
 from jaxsubdiv.frames import Frame
-from jaxsubdiv.linalg import of_moderate_length
+from jaxsubdiv.linalg import scale_to_moderate_length
 
 _LABELS, _SLICE = ("label", "contour"), "slice"
 _WHOLE = re.compile(r"[+-]?[0-9]{1,9}(\.0*)?")  # as large as 32 bits hold
@@ -25,21 +25,21 @@ class ScanError(ValueError):
     """A scan cannot be fitted as it is; the text names the rows and what to do."""
 
 
-def _optional(value: object) -> Array | None:
+def _convert(value: object) -> Array | None:
     return None if value is None else strong_float(value)
 
 
-def _optional_directions(value: object) -> Array | None:
+def _convert_directions(value: object) -> Array | None:
     if value is None or isinstance(value, Array):
-        return _optional(value)
+        return _convert(value)
     rows = np.asarray(value)
     if rows.shape[1:] != (3,):
         return strong_float(rows)  # refused later, by its shape
-    directions = of_moderate_length(rows.astype(float))
+    directions = scale_to_moderate_length(rows.astype(float))
     return strong_float(directions.astype(rows.dtype) if rows.dtype.kind == "f" else directions)
 
 
-def _optional_whole(value: object) -> Array | None:
+def _convert_whole(value: object) -> Array | None:
     if value is None:
         return None
     values = np.asarray(value)
@@ -48,14 +48,14 @@ def _optional_whole(value: object) -> Array | None:
     return jnp.asarray(values, jnp.int32)
 
 
-def _optional_regions(value: Any) -> js.Regions | None:
+def _convert_regions(value: Any) -> js.Regions | None:
     try:
         return js.as_regions(value)
     except ValueError as error:
         raise ScanError(f"`regions`: {error}") from None
 
 
-def _optional_faces(value: object) -> np.ndarray | None:
+def _convert_faces(value: object) -> np.ndarray | None:
     faces = None if value is None else np.asarray(value)
     if faces is None or not faces.size:
         return None
@@ -99,15 +99,15 @@ class Scan(eqx.Module):
     """
 
     points: Float[Array, "p 3"] = eqx.field(converter=strong_float)
-    normals: Float[Array, "p 3"] | None = eqx.field(converter=_optional_directions, default=None)
-    weights: Float[Array, "p"] | None = eqx.field(converter=_optional, default=None)
-    deviations: Float[Array, "p"] | None = eqx.field(converter=_optional, default=None)
-    slices: Int[Array, "p"] | None = eqx.field(converter=_optional_whole, default=None)
-    faces: Int[np.ndarray, "t 3"] | None = eqx.field(converter=_optional_faces, default=None)
+    normals: Float[Array, "p 3"] | None = eqx.field(converter=_convert_directions, default=None)
+    weights: Float[Array, "p"] | None = eqx.field(converter=_convert, default=None)
+    deviations: Float[Array, "p"] | None = eqx.field(converter=_convert, default=None)
+    slices: Int[Array, "p"] | None = eqx.field(converter=_convert_whole, default=None)
+    faces: Int[np.ndarray, "t 3"] | None = eqx.field(converter=_convert_faces, default=None)
     frame: Frame | None = eqx.field(static=True, default=None)
     outlined: bool = eqx.field(static=True, default=False)
     view: Float[np.ndarray, "4 4"] | None = None
-    regions: js.Regions | None = eqx.field(converter=_optional_regions, default=None)
+    regions: js.Regions | None = eqx.field(converter=_convert_regions, default=None)
 
     def __check_init__(self):
         if self.points.ndim != 2 or self.points.shape[-1] != 3 or len(self.points) == 0:
@@ -160,7 +160,7 @@ class Scan(eqx.Module):
         weights = self.weights / jnp.max(self.weights)  # so that no sum leaves the range of single precision
         return weights / jnp.mean(weights, where=weights > 0)
 
-    def drawn(self, n: int) -> "Scan":
+    def draw(self, n: int) -> "Scan":
         """At most `n` of the points that count, drawn at random, always the same."""
         if n >= self.n_points:
             return self
@@ -186,7 +186,7 @@ class Scan(eqx.Module):
             regions=None if self.regions is None else self.regions.take(chosen),
         )
 
-    def without_slices(self) -> "Scan":
+    def drop_slices(self) -> "Scan":
         """The same points, each for itself, without their labels."""
         return Scan(self.points, self.normals, self.weights, self.deviations)
 

@@ -20,7 +20,7 @@ class Arrowhead(NamedTuple):
     border: Float[np.ndarray, "o k"]
     corner: Float[np.ndarray, "k k"]
 
-    def plus(self, other: "Arrowhead") -> "Arrowhead":
+    def add(self, other: "Arrowhead") -> "Arrowhead":
         """The sum of both."""
         return Arrowhead(*(a + b for a, b in zip(self, other, strict=True)))
 

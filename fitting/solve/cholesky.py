@@ -182,11 +182,11 @@ class Factor:
             TRSM(1.0, corner, own.T, side=1, overwrite_b=1)
             if len(front.rows):
                 x[front.rows] -= side.T @ own
-        return self._back(x).reshape(np.shape(sides))
+        return self._solve_back(x).reshape(np.shape(sides))
 
     def sample(self, normal: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
         """Vectors of covariance A^-1, from independent standard normal numbers."""
-        return self._back(np.array(normal, float, order="C"))
+        return self._solve_back(np.array(normal, float, order="C"))
 
     def inverse_blocks(self, columns: Int[np.ndarray, "f d"]) -> Float[np.ndarray, "f d d"]:
         """The blocks A^-1[columns[i]][:, columns[i]], each set of columns being coupled pairwise in the pattern.
@@ -227,7 +227,7 @@ class Factor:
             parts.append((front, panel[: front.own].T, panel[front.own :].T))
         return parts
 
-    def _back(self, x: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+    def _solve_back(self, x: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
         """R^-1 x, in the order of the matrix; overwrites x."""
         for front, corner, side in reversed(self._parts()):
             own = x[front.start : front.stop]
@@ -271,13 +271,13 @@ def analyse(pattern: sp.csc_array) -> Symbolic:
     parts, rows, parents = _fronts(graph, weight, _dissect(graph, weight))
 
     # from nodes to unknowns: the nodes follow each other as in `parts`, each with all its unknowns
-    order = np.argsort(np.argsort(_joined(parts))[node_of], kind="stable")
+    order = np.argsort(np.argsort(_join(parts))[node_of], kind="stable")
     step = np.append(np.argsort(order), n)
     own = np.array([weight[part].sum() for part in parts], int)
     steps = [np.flatnonzero(np.isin(node_of[order], nodes)) for nodes in rows]
     count = np.array([len(some) for some in steps], int)
     front_of = np.repeat(np.arange(len(parts)), own)
-    keys = _joined([number * n + some for number, some in enumerate(steps)])
+    keys = _join([number * n + some for number, some in enumerate(steps)])
     layout = Layout(front_of, np.cumsum(own) - own, own, keys, np.cumsum(count) - count)
 
     panel_begin = np.cumsum(own * (own + count)) - own * (own + count)
@@ -301,7 +301,7 @@ def analyse(pattern: sp.csc_array) -> Symbolic:
     return Symbolic(order, step, full.indptr, full.indices, source, target, tuple(fronts), layout)
 
 
-def _joined(arrays: list[np.ndarray]) -> Int[np.ndarray, " n"]:
+def _join(arrays: list[np.ndarray]) -> Int[np.ndarray, " n"]:
     """One array of integers of several, or of none."""
     return np.concatenate([np.empty(0, int), *arrays])
 
@@ -340,13 +340,13 @@ def _dissect(graph: sp.csr_array, weight: Int[np.ndarray, " N"]) -> list[Int[np.
                     out += split(nodes[piece])
                     continue
                 small.append(nodes[piece])
-                if weight[_joined(small)].sum() > LEAF:
-                    out.append(_joined(small))
+                if weight[_join(small)].sum() > LEAF:
+                    out.append(_join(small))
                     small = []
-            return out + [_joined(small)] * bool(small)
+            return out + [_join(small)] * bool(small)
         # a smooth field from one end of the part to the other, cut near the middle where the separator is small
         smooth = sp.csr_array(part.multiply(1 / part.sum(1)[:, None]))
-        field = _end_to_end(part)
+        field = _order_end_to_end(part)
         for _ in range(6):
             field = smooth @ field
         by_field = np.argsort(field, kind="stable")
@@ -369,7 +369,7 @@ def _dissect(graph: sp.csr_array, weight: Int[np.ndarray, " N"]) -> list[Int[np.
     return split(np.arange(len(weight))) if len(weight) else []
 
 
-def _end_to_end(part: sp.csr_array) -> Float[np.ndarray, " N"]:
+def _order_end_to_end(part: sp.csr_array) -> Float[np.ndarray, " N"]:
     """How much nearer each node of a connected graph is to one end of it than to the other."""
     distance = csgraph.dijkstra(part, indices=0, unweighted=True)
     one = csgraph.dijkstra(part, indices=int(np.argmax(distance)), unweighted=True)
@@ -387,7 +387,7 @@ def _fronts(
     rows: list[np.ndarray] = []
     children: list[list[int]] = [[] for _ in parts]
     for number, part in enumerate(parts):
-        coupled = np.unique(_joined([graph[part].indices] + [rows[child] for child in children[number]]))
+        coupled = np.unique(_join([graph[part].indices] + [rows[child] for child in children[number]]))
         rows.append(coupled[front_of[coupled] > number])
         for child in sorted(children[number], key=lambda c: -weight[rows[c]].sum()):
             k, r = int(weight[parts[child]].sum()), int(weight[rows[child]].sum())

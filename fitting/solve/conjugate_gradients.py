@@ -42,11 +42,11 @@ class ConjugateGradients(lx.AbstractLinearSolver):
         def step(carry: tuple) -> tuple:
             k, x, left, direction, gamma, first = carry
             along = state.mv(direction)  # 0 in the first step, which only finds the gradient
-            alpha = _over(gamma, jnp.sum(along**2))
+            alpha = _divide(gamma, jnp.sum(along**2))
             x, left = x + alpha * direction, left - alpha * along
             gradient = state.T.mv(left)
             new = jnp.sum(gradient**2)
-            direction = gradient + _over(new, gamma) * direction
+            direction = gradient + _divide(new, gamma) * direction
             return k + 1, x, left, direction, new, jnp.where(k == 0, new, first)
 
         k, x, *_ = lax.while_loop(goes_on, step, (jnp.int32(0), x, vector, x, zero, zero))
@@ -69,10 +69,10 @@ class ConjugateGradients(lx.AbstractLinearSolver):
             def step(carry: tuple) -> tuple:
                 k, x, left, direction, gamma = carry
                 along = multiply(direction)
-                alpha = _over(gamma, jnp.sum(direction * along))
+                alpha = _divide(gamma, jnp.sum(direction * along))
                 x, left = x + alpha * direction, left - alpha * along
                 new = jnp.sum(left**2)
-                return k + 1, x, left, left + _over(new, gamma) * direction, new
+                return k + 1, x, left, left + _divide(new, gamma) * direction, new
 
             return lax.while_loop(goes_on, step, (jnp.int32(0), zero, side, side, jnp.sum(side**2)))[1]
 
@@ -110,25 +110,25 @@ class OperatorEquations:
 
     def step(self, damping: Float[Array, "n"], active: Bool[Array, "k"]) -> Float[Array, "n"]:
         """The most probable offset, to first order."""
-        free = self._free(active)
+        free = self._free_mask(active)
         roots = {name: jnp.sqrt(precision) for name, precision in self._precisions.items()}
 
-        def weighed(vector: Float[Array, "n"]) -> Float[Array, "m"]:
+        def weigh(vector: Float[Array, "n"]) -> Float[Array, "m"]:
             rows = self._derivative(free * vector)
-            return jnp.concatenate([*(roots[name] * rows[name] for name in rows), self._damped(damping, free * vector)])
+            return jnp.concatenate([*(roots[name] * rows[name] for name in rows), self._damp(damping, free * vector)])
 
         right = [-roots[name] * row for name, row in self.values.items()]
-        sides = jnp.concatenate([*right, jnp.zeros_like(self._damped(damping, self._zero))])
-        operator = lx.FunctionLinearOperator(weighed, jax.eval_shape(lambda: self._zero))
+        sides = jnp.concatenate([*right, jnp.zeros_like(self._damp(damping, self._zero))])
+        operator = lx.FunctionLinearOperator(weigh, jax.eval_shape(lambda: self._zero))
         return free * lx.linear_solve(operator, sides, self._solver, throw=False).value
 
     def solver(self, which: str, damping: Float[Array, "n"], active: Bool[Array, "k"]) -> Callable:
         """Solves with the damped normal matrix of "all" rows, or of those of the "prior"s alone."""
-        free = self._free(active)
+        free = self._free_mask(active)
         names = [name for name in self.values if which == "all" or name != "distance"]
 
         def damp(vector: Float[Array, "n"]) -> Float[Array, "m"]:
-            return self._damped(damping, vector)
+            return self._damp(damping, vector)
 
         back = jax.linear_transpose(damp, self._zero)
 
@@ -149,21 +149,21 @@ class OperatorEquations:
 
     def transposed(self, name: str, x: Float[Array, "m s"]) -> Float[Array, "n s"]:
         """Their transposed derivatives times values a row."""
-        return jax.vmap(lambda column: self._back({name: column}), 1, 1)(x)
+        return jax.vmap(lambda column: self._multiply_transposed({name: column}), 1, 1)(x)
 
     def _normal(self, names: list[str], vector: Float[Array, "n"]) -> Float[Array, "n"]:
         rows = self._derivative(vector)
-        return self._back({name: self._precisions[name] * rows[name] for name in names})
+        return self._multiply_transposed({name: self._precisions[name] * rows[name] for name in names})
 
-    def _back(self, rows: dict[str, Float[Array, "_"]]) -> Float[Array, "n"]:
+    def _multiply_transposed(self, rows: dict[str, Float[Array, "_"]]) -> Float[Array, "n"]:
         return self._transposed({name: rows.get(name, jnp.zeros_like(row)) for name, row in self.values.items()})[0]
 
-    def _free(self, active: Bool[Array, "k"]) -> Float[Array, "n"]:
+    def _free_mask(self, active: Bool[Array, "k"]) -> Float[Array, "n"]:
         free = jnp.asarray(self.model.is_free, self._zero.dtype)
         own = jnp.ones(self.model.layout.n_own, bool)
         return jnp.where(jnp.concatenate([own, active]), free, 0.0)
 
-    def _damped(self, damping: Float[Array, "n"], vector: Float[Array, "n"]) -> Float[Array, "n"]:
+    def _damp(self, damping: Float[Array, "n"], vector: Float[Array, "n"]) -> Float[Array, "n"]:
         """How far the unknowns move, over what damps them; vertices about their common motion, where that is free."""
         layout = self.model.layout
         if "motion" in dict(layout.shared) and layout.has_vertices:
@@ -173,5 +173,5 @@ class OperatorEquations:
         return jnp.sqrt(damping) * vector
 
 
-def _over(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
+def _divide(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.where(b > 0, a / jnp.where(b > 0, b, 1.0), 0.0)

@@ -11,17 +11,15 @@ import itertools
 import math
 from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 import jaxsubdiv as js
 
 from ..model.residual import Model, Pairs
-from ..model.unknowns import AnyArray, Layout, Unknowns, Variables
+from ..model.unknowns import AnyArray, Layout
+from .derivatives import Derivatives
 
 _ROWS_A_BLOCK = 24
 _ENTRIES_AT_ONCE = 1 << 22  # of the faces' matrices, likewise
@@ -67,15 +65,10 @@ class Patches(NamedTuple):
     slots: Int[np.ndarray, "g 4"]
     """Where in its patch each corner of a face of the surface stands; corners as `corner_weights` has them."""
 
-
-class Derivatives(NamedTuple):
-    """Values at the start of a sweep, and their derivatives along the seeds of the elements, the last seed included."""
-
-    surface: Float[Array, "v 3"]
-    rows: Float[Array, "m"]
-    """Of the face priors, one after the other."""
-    of_surface: Float[Array, "v 3 s"]
-    of_rows: Float[Array, "m s"]
+    @property
+    def corners(self) -> Int[np.ndarray, "g 4"]:
+        """Vertices of every face of the surface; the last of a triangle twice."""
+        return self.vertices[self.owner[:, None], self.slots]
 
 
 def face_corners(faces: dict[int, Any]) -> Int[np.ndarray, "g 4"]:
@@ -84,10 +77,10 @@ def face_corners(faces: dict[int, Any]) -> Int[np.ndarray, "g 4"]:
     return np.concatenate([triangles[:, [0, 1, 2, 2]], quads])
 
 
-def find_patches(surface: js.RefinedSurface, owner: Int[np.ndarray, "g"], n_control_faces: int) -> Patches:
-    """The patches of a surface, from the control face of each of its faces."""
-    corners = face_corners(surface.faces)
-    n = surface.vertices.shape[0]
+def find_patches(faces: dict[int, Any], owner: Int[np.ndarray, "g"], n_control_faces: int) -> Patches:
+    """The patches of a surface, from its faces and the control face of each."""
+    corners = face_corners(faces)
+    n = int(corners.max()) + 1
     keys, place = np.unique(owner[:, None].astype(np.int64) * n + corners, return_inverse=True)
     of_key = keys // n
     counts = np.bincount(of_key, minlength=n_control_faces)
@@ -134,44 +127,6 @@ def n_lengths(layout: Layout) -> int:
     return next((math.prod(of.shape) for name, of in layout.shared if name == "h"), 0)
 
 
-def surface_and_rows(model: Model, y: Variables, offset: Unknowns, held: dict[str, Any]) -> tuple[Array, Array]:
-    """The surface's vertices, and the rows of the face priors one after the other, at an offset."""
-    moved = model.retract(y, offset)
-    surface = model.refine(moved)
-    place = model.place(moved, surface)
-    none = jnp.zeros(0, surface.vertices.dtype)
-    return surface.vertices, jnp.concatenate([none] + [one.rows(place, held[one.name]) for one in model.face_priors])
-
-
-@eqx.filter_jit
-def differentiate(
-    model: Model, y: Variables, held: dict[str, Any], seeds: Float[Array | np.ndarray, "s n"]
-) -> Derivatives:
-    """The surface and the rows of the face priors at the start of a sweep, and their derivatives.
-
-    Args:
-        held: what each prior holds.
-        seeds: see `Elements`.
-    """
-    dtype, split = y.control.vertices.dtype, model.layout.split
-    zero = split(jnp.zeros(model.layout.n, dtype))
-    (surface, rows), derivative = jax.linearize(lambda offset: surface_and_rows(model, y, offset, held), zero)
-    of_surface, of_rows = jax.lax.map(lambda seed: derivative(split(seed)), jnp.asarray(seeds, dtype))
-    return Derivatives(surface, rows, jnp.moveaxis(of_surface, 0, -1), of_rows.T)
-
-
-@eqx.filter_jit
-def differentiate_across(
-    model: Model, y: Variables, seeds: Float[Array | np.ndarray, "s n"], normals: Float[Array, "v 3"]
-) -> Float[Array, "v s"]:
-    """How far each vertex of the surface moves along its normal, for a move of the unknowns along each seed."""
-    dtype, split = y.control.vertices.dtype, model.layout.split
-    zero = split(jnp.zeros(model.layout.n, dtype))
-    _, derivative = jax.linearize(lambda offset: model.refine(model.retract(y, offset)).vertices, zero)
-    across = jax.lax.map(lambda seed: jnp.sum(derivative(split(seed)) * normals, axis=1), jnp.asarray(seeds, dtype))
-    return across.T
-
-
 def forgets_some(elements: Elements, patches: Patches, found: Derivatives, row_faces: Int[np.ndarray, "m"]) -> bool:
     """Whether values depend on unknowns that the elements do not know: seen in the derivative along the last seed."""
     of_surface, of_rows = np.asarray(found.of_surface), np.asarray(found.of_rows)
@@ -179,21 +134,19 @@ def forgets_some(elements: Elements, patches: Patches, found: Derivatives, row_f
     parts = np.zeros((len(elements.columns), len(elements.seeds)), of_surface.dtype)
     last = np.append(elements.seeds[-1, : elements.n], 0.0)[elements.columns]
     np.add.at(parts, (np.arange(len(parts))[:, None], elements.seeds_of), last)
-    n, w = patches.vertices.shape
-    of_patches = of_surface[patches.vertices].reshape(n, 3 * w, -1) @ parts[..., None]
+    of_patches = np.einsum("sfwx,fs->fwx", of_surface[:, patches.vertices], parts)
     corners = patches.owner[:, None], patches.slots
-    surface = of_patches.reshape(n, w, 3)[corners] - of_surface[patches.vertices[corners], :, -1]
-    rows = np.einsum("ms,ms->m", of_rows, parts[row_faces]) - of_rows[:, -1]
-    both = ((surface, of_surface[:, :, -1]), (rows, of_rows[:, -1]))
+    surface = of_patches[corners] - of_surface[-1, patches.vertices[corners]]
+    rows = np.einsum("sm,ms->m", of_rows, parts[row_faces]) - of_rows[-1]
+    both = ((surface, of_surface[-1]), (rows, of_rows[-1]))
     return any(np.abs(off).max(initial=0) > _WRONG * np.abs(of).max(initial=0) for off, of in both)
 
 
 def slopes_of_rows(
-    elements: Elements, of_rows: Float[AnyArray, "m s"], face: Int[np.ndarray, "m"]
+    elements: Elements, of_rows: Float[AnyArray, "s m"], face: Int[np.ndarray, "m"]
 ) -> Float[np.ndarray, "m d"]:
     """Derivatives of rows by the unknowns of their faces, from those along the seeds."""
-    slopes = np.take_along_axis(np.asarray(of_rows), elements.seeds_of[face], axis=1)
-    return slopes.astype(np.float64)
+    return np.asarray(of_rows)[elements.seeds_of[face], np.arange(len(face))[:, None]].astype(np.float64)
 
 
 def slopes_of_distances(
@@ -209,9 +162,9 @@ def slopes_of_distances(
     factors = weights[:, :, None] * directions[:, None, :]
     coordinate = 3 * np.asarray(pairs.corners)[:, :, None] + np.arange(3)
     by_coordinates = sp.csr_array(
-        (factors.ravel(), coordinate.ravel(), 12 * np.arange(n + 1)), shape=(n, 3 * len(of_surface))
+        (factors.ravel(), coordinate.ravel(), 12 * np.arange(n + 1)), shape=(n, of_surface[0].size)
     )
-    along = by_coordinates @ of_surface.reshape(3 * len(of_surface), -1)
+    along = np.stack([by_coordinates @ of_seed.ravel() for of_seed in of_surface])
     return slopes_of_rows(elements, along, patches.owner[at])
 
 
@@ -312,7 +265,7 @@ def _slopes_of_patches(
 ) -> Float[np.ndarray, "f c d"]:
     """Derivatives of the vertices of some patches by the unknowns of their faces."""
     vertices, seeds_of = patches.vertices[those], elements.seeds_of[those]
-    place = vertices[:, :, None, None], np.arange(3)[:, None], seeds_of[:, None, None, :]
+    place = seeds_of[:, None, None, :], vertices[:, :, None, None], np.arange(3)[:, None]
     return np.asarray(found.of_surface)[place].astype(np.float64).reshape(len(vertices), -1, seeds_of.shape[1])
 
 

@@ -21,9 +21,9 @@ from ..model.priors.shifts import ShiftPrior
 from ..model.residual import Held, Model, signed_distances
 from ..model.unknowns import Unknowns, Variables
 from .arrowhead import Arrowhead, ArrowheadFactor, factorise_arrowhead, solve_preconditioned
+from .derivatives import differentiate
 from .elements import (
     are_many,
-    differentiate,
     distance_matrix,
     distances_transposed,
     jacobian,
@@ -59,7 +59,7 @@ class SparseEquations:
 
     def __init__(self, structure: Structure, model: Model, y: Variables, held: Held):
         self.structure, self.model, self.y, self.held = structure, model, y, held
-        self._bare = bare = model.bare()
+        self._bare = bare = model.strip_strengths()
         self.gradient = np.zeros(model.layout.n)
         self.values: dict[str, Float[np.ndarray, "m"]] = {}
         """Rows of each prior, before they are weighed."""
@@ -71,7 +71,7 @@ class SparseEquations:
         self.data = self._add_distances()
         self.prior = self._add_face_priors()
         for tied in structure.tied:
-            self.prior = self.prior.plus(self._add_tied(tied))
+            self.prior = self.prior.add(self._add_tied(tied))
 
     def jacobian(self, name: str) -> sp.csr_array:
         """Derivatives of the rows of a prior by all unknowns; 0 by those that are fixed."""
@@ -97,15 +97,15 @@ class SparseEquations:
     ) -> Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray, "n s"]]:
         """Solves with the damped normal matrix of "all" rows, or of those of the "prior"s alone: exactly, or where
         priors couple vertices far from each other by conjugate gradients, the near part of the matrix going before."""
-        matrix = self.prior if which == "prior" else self.data.plus(self.prior)
+        matrix = self.prior if which == "prior" else self.data.add(self.prior)
         factor = self._known.get((which, damping.tobytes()))
         is_near = self.structure.near is not None
         if factor is None:
             factor = self._known[which, damping.tobytes()] = self.factorise(matrix, damping, active, near=is_near)
-        free = self._free(active)[:, None]
+        free = self._free_mask(active)[:, None]
         if not is_near:
             return lambda sides: free * factor.solve(free * sides)
-        whole = self._damped(matrix, damping, active)
+        whole = self._add_damping(matrix, damping, active)
 
         def multiply(x: Float[np.ndarray, "n s"]) -> Float[np.ndarray, "n s"]:
             return free * self.multiply(whole, x)
@@ -120,7 +120,7 @@ class SparseEquations:
         """The normal matrix of the distances times vectors."""
         return self.multiply(self.data, x)
 
-    def _free(self, active: Bool[np.ndarray, "k"] | None) -> Float[np.ndarray, "n"]:
+    def _free_mask(self, active: Bool[np.ndarray, "k"] | None) -> Float[np.ndarray, "n"]:
         free = np.array(self.model.is_free, float)
         if active is not None:
             free[self.structure.n :] *= active
@@ -141,14 +141,14 @@ class SparseEquations:
             active: which shared unknowns take part; the others stay.
             near: without the entries of priors that couple vertices far from each other, which take time.
         """
-        structure, damped = self.structure, self._damped(matrix, damping, active)
+        structure, damped = self.structure, self._add_damping(matrix, damping, active)
         if not near:
             return factorise_arrowhead(damped, structure.pattern, structure.symbolic)
         assert structure.near is not None
         symbolic, place = structure.near_symbolic
         return factorise_arrowhead(damped._replace(inner=damped.inner[place]), structure.near, symbolic)
 
-    def _damped(
+    def _add_damping(
         self, matrix: Arrowhead, damping: Float[np.ndarray, "n"], active: Bool[np.ndarray, "k"] | None
     ) -> Arrowhead:
         """A matrix with a diagonal, and 1 on that of what is fixed; see `factorise`."""
@@ -175,7 +175,7 @@ class SparseEquations:
 
     def to_dense(self, damping: Float[np.ndarray, "n"], which: Int[np.ndarray, "u"]) -> Float[np.ndarray, "u u"]:
         """The damped normal matrix of some unknowns, the others held."""
-        matrix, n, pattern = self.data.plus(self.prior), self.structure.n, self.structure.pattern
+        matrix, n, pattern = self.data.add(self.prior), self.structure.n, self.structure.pattern
         inner = sp.csc_array((matrix.inner, pattern.indices, pattern.indptr), shape=(n, n)).toarray()
         whole = np.block([[inner, matrix.border], [matrix.border.T, matrix.corner]]) + np.diag(damping)
         return whole[np.ix_(which, which)]
@@ -252,7 +252,7 @@ class SparseEquations:
         self.gradient[: elements.n] += times_transposed(elements, by, weights * rows, self._row_faces)
         found = self.structure.arrange(normal_matrix(elements, by, weights, self._row_faces), self._n_shared)
         for prior in self.model.face_priors:
-            by_shifts = prior.by_shifts(held.priors[prior.name])
+            by_shifts = prior.differentiate_shifts(held.priors[prior.name])
             if by_shifts is not None and "shifts" in dict(self.model.layout.shared):
                 own = self._rows_of[prior.name]
                 weighed = sp.csr_array(sp.diags_array(weights[own]) @ by_shifts)
@@ -329,13 +329,13 @@ class SparseNormal(lx.AbstractLinearSolver):
         structure = self.structure
         dtype = jax.tree.leaves(vector)[0].dtype
 
-        def along(seeds: Float[np.ndarray, "s n"]) -> dict[str, Float[Array, "s m"]]:
+        def differentiate_along(seeds: Float[np.ndarray, "s n"]) -> dict[str, Float[Array, "s m"]]:
             return jax.lax.map(lambda seed: state.mv(structure.layout.split(seed)), jnp.asarray(seeds, dtype))
 
-        of_faces = along(structure.elements.seeds)
+        of_faces = differentiate_along(structure.elements.seeds)
         rows = jnp.concatenate([vector[name] for name in self.names])
         by = jnp.concatenate([of_faces[name] for name in self.names], axis=1)
-        of_ties = [(vector[one.prior], along(one.seeds)[one.prior]) for one in structure.tied]
+        of_ties = [(vector[one.prior], differentiate_along(one.seeds)[one.prior]) for one in structure.tied]
         shape = jax.ShapeDtypeStruct((structure.layout.n,), dtype)
         solution = jax.pure_callback(functools.partial(_solve, structure), shape, self.faces, rows, by, of_ties)
         return structure.layout.split(solution), lx.RESULTS.successful, {}
@@ -357,7 +357,7 @@ def _solve(
     face, n = np.asarray(faces), structure.layout.n
     elements, n_shared = structure.elements, structure.layout.n - structure.n
     left, slopes = np.asarray(rows, np.float64), np.asarray(by, np.float64)
-    local = slopes_of_rows(elements, slopes.T, face)
+    local = slopes_of_rows(elements, slopes, face)
     gradient = np.zeros(n)
     gradient[: elements.n] = times_transposed(elements, local, left, face)
     matrix = structure.arrange(normal_matrix(elements, local, np.ones(len(left)), face), n_shared)
@@ -365,7 +365,7 @@ def _solve(
         values, along = np.asarray(values, np.float64), np.asarray(along, np.float64)
         found = sparse_rows(np.take_along_axis(along.T, tied.seeds_of, axis=1), tied.columns, n)
         gradient += found.T @ values
-        matrix = matrix.plus(structure.arrange_sparse(sp.csc_array(found.T @ found)))
+        matrix = matrix.add(structure.arrange_sparse(sp.csc_array(found.T @ found)))
     values = matrix.inner.copy()
     values[structure.diagonal] += _REGULAR * np.abs(values[structure.diagonal]).max()
     factor = factorise_arrowhead(matrix._replace(inner=values), structure.pattern, structure.symbolic)

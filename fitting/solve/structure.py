@@ -16,7 +16,8 @@ from ..model.unknowns import Layout, Variables
 from .arrowhead import Arrowhead
 from .cholesky import Symbolic
 from .cholesky import analyse as analyse_pattern
-from .elements import Elements, Patches, colour, differentiate, find_elements, find_patches, forgets_some
+from .derivatives import differentiate
+from .elements import Elements, Patches, colour, find_elements, find_patches, forgets_some
 
 _MOST_RINGS = 3
 
@@ -67,16 +68,10 @@ class Structure:
         assert self.near is not None
         return analyse_pattern(self.near), np.searchsorted(_keys(self.pattern), _keys(self.near))
 
-    @property
-    def corners(self) -> Int[np.ndarray, "g 4"]:
-        """Vertices of every face of the surface; the last of a triangle twice."""
-        patches = self.patches
-        return patches.vertices[patches.owner[:, None], patches.slots]
-
     def faces_of_vertices(self, n: int) -> Int[np.ndarray, "n"]:
         """A control face that each of the `n` vertices of the surface lies in."""
         faces = np.zeros(n, np.int64)
-        faces[self.corners] = self.patches.owner[:, None]
+        faces[self.patches.corners] = self.patches.owner[:, None]
         return faces
 
     def arrange(self, values: Float[np.ndarray, "_"], n_shared: int) -> Arrowhead:
@@ -112,10 +107,10 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> Structur
     Raises:
         ValueError: a face of the scheme depends on too many control vertices.
     """
-    model = model.bare()
+    model = model.strip_strengths()
     surface = model.refine(y)
     owner = js.control_faces_of(model.scheme, model.topology, surface, y.control)
-    patches = find_patches(surface, owner, model.topology.n_control_faces)
+    patches = find_patches(surface.faces, owner, model.topology.n_control_faces)
     rows = row_faces(model, held)
     for rings in range(1, _MOST_RINGS + 1):
         elements = find_elements(model, rings)
@@ -134,10 +129,10 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> Structur
     near = None
     for one in sorted(tied, key=lambda one: one.is_distant):
         if one.is_distant and near is None:
-            near = _sorted(pattern)
+            near = _sort(pattern)
         by = sparse_rows(np.ones(one.columns.shape), one.columns, layout.n)
         pattern = pattern + abs(sp.csc_array((by.T @ by)[:n, :n]))
-    pattern = _sorted(pattern)
+    pattern = _sort(pattern)
     keys, column = _keys(pattern), _columns(pattern)
     of_elements = elements.pattern
     source = np.flatnonzero((of_elements.indices < n) & (_columns(of_elements) < n))
@@ -195,7 +190,7 @@ def sparse_rows(by: Float[np.ndarray, "m d"], columns: Int[np.ndarray, "m d"], n
     return sp.csr_array(table[:, :n])
 
 
-def _sorted(pattern: sp.sparray) -> sp.csc_array:
+def _sort(pattern: sp.sparray) -> sp.csc_array:
     sorted_pattern = sp.csc_array(pattern)
     sorted_pattern.sort_indices()
     return sorted_pattern

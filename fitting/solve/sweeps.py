@@ -173,7 +173,7 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
         seen = jax.tree.map(np.asarray, look) if xp is np else look
         widest = xp.where(k > 0, state.widest, seen.scale)
         rms, robust_rms = (
-            values.at[k].set(new) if xp is jnp else _replaced(values, int(k), new)
+            values.at[k].set(new) if xp is jnp else _replace(values, int(k), new)
             for values, new in ((state.rms, seen.rms), (state.robust_rms, seen.robust_rms))
         )
         change = xp.abs(seen.robust_rms - state.robust_rms[xp.maximum(k - 1, 0)])
@@ -234,7 +234,7 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
 
         def attempt(hold: AnyArray) -> tuple[AnyArray, AnyArray]:
             step = rows.step(hold, active)
-            return step, self._turned_over(model, y, step, xp)
+            return step, self._find_turned_over(model, y, step, xp)
 
         def hold_faster(hold: AnyArray, turned: AnyArray) -> AnyArray:
             return scale_damping(model, hold, xp.where(turned, HOLD, 1.0), loose, xp)
@@ -282,14 +282,14 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
             return (proposed, after) if bool(finite) else (y, lost)
         return jax.tree.map(lambda a, b: jnp.where(finite, a, b), (proposed, after), (y, lost))
 
-    def _turned_over(self, model: Model, y: Variables, step: AnyArray, xp: Any) -> Bool[AnyArray, "v"]:
+    def _find_turned_over(self, model: Model, y: Variables, step: AnyArray, xp: Any) -> Bool[AnyArray, "v"]:
         """Vertices of control faces that a step would turn upside down."""
         layout = model.layout
         if not layout.has_vertices or (xp is np and not np.isfinite(step).all()):
             return xp.zeros(layout.n_vertices, bool)
         before = xp.asarray(y.control.vertices, step.dtype)
         moved = before + step[: layout.n_own].reshape(layout.n_vertices, layout.width)[:, :3]
-        turned = self.folds.turned_over(moved, xp) & ~self.folds.turned_over(before, xp)
+        turned = self.folds.find_turned_over(moved, xp) & ~self.folds.find_turned_over(before, xp)
         return self.folds.corners_of(turned, xp)
 
 
@@ -300,7 +300,7 @@ def _next_try(carry: tuple, attempt: Callable, hold_faster: Callable) -> tuple:
     return tries + 1, hold, turned, step
 
 
-def _replaced(values: Float[np.ndarray, "n"], k: int, new: AnyArray) -> Float[np.ndarray, "n"]:
+def _replace(values: Float[np.ndarray, "n"], k: int, new: AnyArray) -> Float[np.ndarray, "n"]:
     values = values.copy()
     values[k] = new
     return values
@@ -380,7 +380,7 @@ def hold_sweep(
 
 @eqx.filter_jit
 def _retract(model: Model, y: Variables, step: Float[Array, "n"]) -> Variables:
-    return model.lasting(model.retract(y, model.layout.split(step)))
+    return model.keep_lasting(model.retract(y, model.layout.split(step)))
 
 
 @jax.jit
@@ -420,7 +420,7 @@ def scale_damping(
 ) -> Float[AnyArray, "n"]:
     """The damping, where that of vertices and their normals changes by a factor."""
     layout = model.layout
-    by = xp.concatenate([layout.of_vertices(factor, xp), xp.ones(layout.n - layout.n_own, factor.dtype)])
+    by = xp.concatenate([layout.repeat_per_unknown(factor, xp), xp.ones(layout.n - layout.n_own, factor.dtype)])
     lasting = xp.where(xp.arange(layout.n) < layout.n_own, xp.clip(hold * by, loose, _FASTEST * loose), hold)
     return lasting
 

@@ -96,7 +96,7 @@ class _Map(NamedTuple):
     def __call__(self, x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         return x @ self.linear.T + self.shift
 
-    def back(self, x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def map_back(self, x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         return (x - self.shift) @ np.linalg.inv(self.linear).T
 
 
@@ -182,7 +182,7 @@ def align(
     start = None if placed is None else _landmark_pose(placed, kind)
     if scan.weights is not None:
         scan = scan.rows(np.asarray(scan.weights) > 0)  # the others are as if they were not there
-    points = _thinned(np.asarray(scan.points, np.float64))
+    points = _thin(np.asarray(scan.points, np.float64))
     if not refine:
         if start is None:
             raise ScanError("without `refine` the landmarks must fix the pose: give three or more, not on a line.")
@@ -202,18 +202,18 @@ def align(
     surface, many = sample_faces(mesh, _FINE[1]), _rows(points, _FINE[0])
     fine = [_search(found.pose, many, surface, free, keep, placed, _FINE_STEPS) for found in best]
     fine = [one for one in fine if np.isfinite(one.score)] or fine
-    near = _near(fine)
+    near = _near_distance(fine)
     chosen = min(
         fine, key=lambda one: one.near_score(near) * (_CLEARLY if _angle(one.pose.linear) < 2 * _NEARBY else 1)
     )
     # Of those that came to nearly one pose, the one whose nearer points lie nearest.
-    chosen = min((one for one in fine if _apart(one, chosen) < _SAME_TURN), key=lambda one: one.score)
+    chosen = min((one for one in fine if _turn_between(one, chosen) < _SAME_TURN), key=lambda one: one.score)
     others: list[_Found] = []
     if start is None:
         own = _search(chosen.pose, few, sample_faces(mesh, _COARSE[1]), free, keep, None, _COARSE_STEPS)
         fits = np.quantile(own.distances, _SURE) < _FITS * moments.size
-        other = own if fits else _mirrored(mesh, few, of_mesh, moments, free, keep)
-        as_it_is, mirrored = (one.near_score(_near([own, other])) for one in (own, other))
+        other = own if fits else _align_mirrored(mesh, few, of_mesh, moments, free, keep)
+        as_it_is, mirrored = (one.near_score(_near_distance([own, other])) for one in (own, other))
         if mirrored < _MIRRORED * as_it_is:
             doubts.append(
                 Finding(
@@ -251,7 +251,7 @@ def sample_faces(mesh: js.ControlMesh, n: int) -> _Surface:
     return _Surface(points, unit, float(np.sqrt(total[-1] / n)), KDTree(points))
 
 
-def _thinned(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "q 3"]:
+def _thin(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "q 3"]:
     """The scan without what is scattered, at an even density."""
     if len(points) < 10:
         raise ScanError(f"a scan of {len(points)} points cannot be aligned; 10 are the least.")
@@ -310,10 +310,10 @@ def _starts(template: _Moments, scan: _Moments, kind: Kind) -> list[_Map]:
     nearby = Rotation.from_rotvec(_NEARBY * np.concatenate([axes, 2 * axes]), degrees=True).as_matrix()
     turns += [(sizes[0], turn) for turn in [*nearby, *_quarter_turns()[1:]]]
     turns += [(sizes[-1], scan.axes @ turn @ template.axes.T) for turn in _quarter_turns()]
-    return poses + [_about(size * turn, template, scan) for size, turn in turns]
+    return poses + [_centre(size * turn, template, scan) for size, turn in turns]
 
 
-def _about(linear: Float[np.ndarray, "3 3"], template: _Moments, scan: _Moments) -> _Map:
+def _centre(linear: Float[np.ndarray, "3 3"], template: _Moments, scan: _Moments) -> _Map:
     """Takes the template's middle to the scan's."""
     return _Map(linear, scan.centre - linear @ template.centre)
 
@@ -386,17 +386,17 @@ def _best_starts(
 ) -> list[_Found]:
     """The best few after a short search from each; the first pose, the one given, is always among them."""
     found = [_search(pose, points, surface, kind, keep, placed, _FIRST_STEPS) for pose in poses]
-    found = _best_apart(found, _COARSE_BEST)
+    found = _choose_apart(found, _COARSE_BEST)
     found = [_search(one.pose, points, surface, kind, keep, placed, _COARSE_STEPS) for one in found]
-    return _best_apart(found, _REFINED)
+    return _choose_apart(found, _REFINED)
 
 
-def _best_apart(found: list[_Found], n: int) -> list[_Found]:
+def _choose_apart(found: list[_Found], n: int) -> list[_Found]:
     """The first, the best `n` of the others, and up to `n` more that are turned differently from all of these."""
     others = sorted(found[1:], key=lambda one: one.score)
     apart = others[:n]
     for one in others[n:]:
-        if len(apart) < 2 * n and all(_apart(one, other) > _SAME_TURN for other in apart):
+        if len(apart) < 2 * n and all(_turn_between(one, other) > _SAME_TURN for other in apart):
             apart.append(one)
     return found[:1] + apart
 
@@ -407,7 +407,7 @@ def _spread(pose: _Map, surface: _Surface) -> float:
 
 def _pairs(pose: _Map, points: Float[np.ndarray, "p 3"], surface: _Surface) -> _Pairs:
     """Closest samples are sought in the template's frame, so that its tree stays; distances are the scan's."""
-    row = surface.tree.query(pose.back(points))[1]
+    row = surface.tree.query(pose.map_back(points))[1]
     at = pose(surface.points[row])
     normals = surface.normals[row] @ np.linalg.inv(pose.linear)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -484,7 +484,7 @@ def _step(
 # ------------------------------------------------------------------------------------------------------------- doubts
 
 
-def _apart(one: _Found, other: _Found) -> float:
+def _turn_between(one: _Found, other: _Found) -> float:
     """Degrees between two poses."""
     return _angle(one.pose.linear @ np.linalg.inv(other.pose.linear))
 
@@ -495,7 +495,7 @@ def _angle(linear: Float[np.ndarray, "3 3"]) -> float:
     return float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
 
 
-def _near(found: list[_Found]) -> float:
+def _near_distance(found: list[_Found]) -> float:
     """How far from the best of some poses a point still counts as near."""
     finite = (float(np.quantile(one.distances, _SURE)) for one in found if np.isfinite(one.score))
     return _NEAR * min(finite, default=0.0)
@@ -507,9 +507,9 @@ def _other_answers(chosen: _Found, others: list[_Found], share_of_template: floa
         return []
     # A scan of a part leaves more poses: one that is clearly worse on the whole may be right on another's body.
     alike = _ALIKE if share_of_template > _WHOLE else _ALIKE_IN_PART
-    near = _near([chosen, *others])
+    near = _near_distance([chosen, *others])
     for other in others:
-        angle = _apart(other, chosen)
+        angle = _turn_between(other, chosen)
         as_near = other.near_score(near) < alike * chosen.near_score(near)
         if angle > _FAR_ROTATION and other.score < alike * chosen.score and as_near:
             return [
@@ -523,7 +523,7 @@ def _other_answers(chosen: _Found, others: list[_Found], share_of_template: floa
     return []
 
 
-def _mirrored(
+def _align_mirrored(
     mesh: js.ControlMesh, points: np.ndarray, template: _Moments, scan: _Moments, kind: Kind, keep: float
 ) -> _Found:
     """The best fit to the template seen in a mirror, from the starts that the template itself had."""
@@ -558,7 +558,7 @@ def _finish(
     share = float(counts.mean())
     rms = float(np.sqrt(np.mean(pairs.across[counts] ** 2))) if share else np.inf
     size = _spread(pose, surface)
-    found = _in_words(pose, surface, _rows(np.asarray(scan.points, np.float64), _AT_MOST), limit, share)
+    found = _describe(pose, surface, _rows(np.asarray(scan.points, np.float64), _AT_MOST), limit, share)
     if share and rms > 0.1 * size:
         text = f"the template is {rms:.3g} mm off where it fits best, for a size of {size:.3g} mm."
         doubts.append(Finding("template_off", text, {"rms": rms, "size": size}))
@@ -578,10 +578,10 @@ def _finish(
         warn(f"alignment: {doubt.text}")
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = pose.linear, pose.shift
-    return Alignment(transform, put(mesh, transform), rms, share, tuple(doubts), found)
+    return Alignment(transform, place_mesh(mesh, transform), rms, share, tuple(doubts), found)
 
 
-def _in_words(pose: _Map, surface: _Surface, points: Float[np.ndarray, "p 3"], limit: float, share: float) -> Pose:
+def _describe(pose: _Map, surface: _Surface, points: Float[np.ndarray, "p 3"], limit: float, share: float) -> Pose:
     """A map by its turn, scale and shift, and how much of scan and template lie near each other."""
     scale = float(np.cbrt(np.linalg.det(pose.linear)))
     turn, _ = polar(pose.linear)
@@ -615,7 +615,7 @@ def mirror_image(mesh: js.ControlMesh, landmarks: Landmarks | None = None) -> tu
     return js.ControlMesh(mesh.vertices * flip + about, faces, normals, regions=mesh.regions), landmarks
 
 
-def put(mesh: js.ControlMesh, transform: Float[np.ndarray, "4 4"]) -> js.ControlMesh:
+def place_mesh(mesh: js.ControlMesh, transform: Float[np.ndarray, "4 4"]) -> js.ControlMesh:
     """The mesh where an alignment puts it."""
     pose, normals = _Map(transform[:3, :3], transform[:3, 3]), mesh.normals
     if normals is not None:

@@ -11,7 +11,7 @@ from ..scan.outliers import covariances, first_of_each, neighbour_distance, one_
 from ..scan.scan import Scan, ScanError
 from ..scan.slices import contour_spacing
 from .mesh_topology import component_labels
-from .orient import flipped, orient, plane_fits
+from .orient import find_flipped, orient, plane_fits
 from .poisson import Implicit, poisson
 from .remesh import Dense
 
@@ -114,13 +114,13 @@ def clean_points(
     # Neighbourhoods as wide as the noise needs: a plane through points that are as far off as apart has no direction.
     normals, _, near = plane_fits(points, int(np.clip(16 * (noise / (0.12 * np.median(reach))) ** 2, 16, 60)))
     if given is not None and (given[rows] != 0).any(axis=1).mean() > 0.9:
-        normals = np.where(flipped(normals, given[rows])[:, None], -normals, normals)
+        normals = np.where(find_flipped(normals, given[rows])[:, None], -normals, normals)
         return Cloud(points, normals, reach, noise, True, label)
     # A tree may turn all of what lies past a crease over, and no later step undoes that: of three ways to begin the one
     # whose surface follows its normals best is taken.
     away = points - points.mean(axis=0)
     starts = [orient(points, normals, near, across) for across in (True, False)]
-    starts.append(np.where(flipped(normals, away)[:, None], -normals, normals))
+    starts.append(np.where(find_flipped(normals, away)[:, None], -normals, normals))
     cell = max(float(np.ptp(points, axis=0).max()) / COARSE_CELLS, noise)
     settled = [settle(Cloud(points, start, reach, noise, False, label), cell) for start in starts]
     return max(settled, key=_agreement)[0]
@@ -150,7 +150,7 @@ def _even_rows(points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, "q"]:
     cell = max(float(np.quantile(reach, 0.1)), 1e-6 * float(np.ptp(points, axis=0).max())) / 2
     for _ in range(_THINNINGS):
         low, high = np.quantile(reach, [0.1, 0.9])
-        if high <= _UNEVEN * low and not on_lines(points[rows]):
+        if high <= _UNEVEN * low and not are_on_lines(points[rows]):
             return rows
         thinner = one_a_cell(points, cell)
         if len(thinner) < 10 * LEAST_POINTS:
@@ -160,7 +160,7 @@ def _even_rows(points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, "q"]:
     return rows
 
 
-def on_lines(points: Float[np.ndarray, "p 3"]) -> bool:
+def are_on_lines(points: Float[np.ndarray, "p 3"]) -> bool:
     """Whether most points have their neighbours on a line, as those of contours do."""
     _, near = nearest_rows(KDTree(points), points, min(NEIGHBOUR + 1, len(points)))
     spread = np.linalg.eigvalsh(covariances(points, near))
@@ -170,7 +170,7 @@ def on_lines(points: Float[np.ndarray, "p 3"]) -> bool:
 def _agreement(settled: tuple[Cloud, Implicit]) -> float:
     """Mean cosine between the normals and what the surface has there."""
     cloud, implicit = settled
-    out = implicit.outward(cloud.points)
+    out = implicit.outward_vectors(cloud.points)
     length = np.maximum(np.linalg.norm(out, axis=1), np.finfo(float).tiny)
     return float(np.mean(np.einsum("px,px->p", out, cloud.normals) / length))
 
@@ -185,7 +185,7 @@ def settle(cloud: Cloud, cell: float, smoother: float = 1.0) -> tuple[Cloud, Imp
     normals = cloud.normals
     implicit = poisson(cloud.points, normals, cloud.areas, cell, smoothing)
     for _ in range(_TURNS):
-        wrong = flipped(normals, implicit.outward(cloud.points))
+        wrong = find_flipped(normals, implicit.outward_vectors(cloud.points))
         if wrong.mean() < 1e-3:
             break
         normals = np.where(wrong[:, None], -normals, normals)

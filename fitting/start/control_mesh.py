@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
 import jaxsubdiv as js
+from jaxsubdiv.extras import import_extra
 from jaxsubdiv.half_edges import half_edges
 from jaxsubdiv.notices import warn
 
@@ -18,7 +19,7 @@ from .cloud import Cloud, clean
 from .outline import is_better, parts_of_outline
 from .parts import Part, PartKind, choose, find_parts, points_of_others
 from .reconstruct import reconstruct_smoothly
-from .remesh import Coarse, Dense, coarsen, paired, relaxed
+from .remesh import Coarse, Dense, coarsen, pair_triangles, relax
 
 FaceKind: TypeAlias = Literal["triangle", "quad"]
 
@@ -88,7 +89,8 @@ def make_control_mesh(scan: Scan, *, faces: int, kind: FaceKind, closed: bool | 
         raise ValueError(f"`part` is one of {', '.join(get_args(PartKind))}, or None; got {part!r}.")
     if faces < _LEAST_FACES:
         raise ValueError(f"`faces` must be {_LEAST_FACES} or more; got {faces}.")
-    _need_extra()
+    for library in ("pyacvd", "rustworkx"):
+        import_extra(library, "mesh", "control meshes made from scans")
     cloud = clean(scan)
     parts = find_parts(cloud, closed)
     thin = closed is None and is_better(scan, cloud, parts)
@@ -103,7 +105,7 @@ def make_control_mesh(scan: Scan, *, faces: int, kind: FaceKind, closed: bool | 
     ]
     points = np.asarray(scan.points, np.float64)
     left_out = points_of_others(points, chosen, others) if others else np.zeros(len(points), bool)
-    return Made(_side_by_side(meshes), findings, ~left_out)
+    return Made(_join(meshes), findings, ~left_out)
 
 
 def _mesh_of(part: Part, faces: int, kind: FaceKind, thin: bool) -> js.ControlMesh:
@@ -111,7 +113,7 @@ def _mesh_of(part: Part, faces: int, kind: FaceKind, thin: bool) -> js.ControlMe
     # The two walls of something thin need clusters as small as it is thick, and its handles are true.
     tries = (coarsen(part.dense, round(more * triangles), part.topology) for more in (_MORE if thin else (1.0,)))
     coarse = next((found for found in tries if found is not None), None)
-    if coarse is None and (smooth := _without_handles(part, triangles)) is not None:
+    if coarse is None and (smooth := _drop_handles(part, triangles)) is not None:
         coarse = coarsen(smooth.dense, triangles, smooth.topology)
         if coarse is not None:
             warn(
@@ -124,14 +126,14 @@ def _mesh_of(part: Part, faces: int, kind: FaceKind, thin: bool) -> js.ControlMe
             f"{faces} faces are too few for what the scan shows ({part.topology}). Ask for more faces; if there should "
             "be fewer handles or rims, the points are too sparse or noisy to tell the sheets apart."
         )
-    coarse = relaxed(paired(coarse) if kind == "quad" else coarse, part.dense)
-    vertices, normals = _onto_points(coarse, part.dense, part.cloud)
+    coarse = relax(pair_triangles(coarse) if kind == "quad" else coarse, part.dense)
+    vertices, normals = _move_onto_points(coarse, part.dense, part.cloud)
     mesh = js.ControlMesh(vertices, {size: rows.astype(np.int32) for size, rows in coarse.faces.items()}, normals)
     _check_near(mesh, part)
     return mesh
 
 
-def _without_handles(part: Part, triangles: int) -> Part | None:
+def _drop_handles(part: Part, triangles: int) -> Part | None:
     """The part with fewer handles, where its surface stays within two edges of so many triangles of the points; else
     None."""
     if not part.topology.genus:
@@ -156,7 +158,7 @@ def _check_near(mesh: js.ControlMesh, part: Part) -> None:
         )
 
 
-def _side_by_side(meshes: list[js.ControlMesh]) -> js.ControlMesh:
+def _join(meshes: list[js.ControlMesh]) -> js.ControlMesh:
     """One mesh of several that do not hang together."""
     if len(meshes) == 1:
         return meshes[0]
@@ -167,16 +169,6 @@ def _side_by_side(meshes: list[js.ControlMesh]) -> js.ControlMesh:
     }
     normals = np.concatenate([np.asarray(mesh.normals) for mesh in meshes])
     return js.ControlMesh(np.concatenate([mesh.vertices for mesh in meshes]), faces, normals)
-
-
-def _need_extra() -> None:
-    try:
-        import pyacvd  # noqa: F401
-        import rustworkx  # noqa: F401
-    except ImportError as error:
-        raise ImportError(
-            f"a control mesh from a scan needs the extra `mesh`: pip install 'jaxsubdiv[mesh]' ({error})."
-        ) from error
 
 
 def _unit_doubt(size: float) -> tuple[Finding, ...]:
@@ -192,7 +184,7 @@ def _unit_doubt(size: float) -> tuple[Finding, ...]:
 # ------------------------------------------------------------------------------------------------------------ placing
 
 
-def _onto_points(
+def _move_onto_points(
     coarse: Coarse, dense: Dense, cloud: Cloud
 ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"]]:
     """Vertices on the points and normals there, by a quadric through the points around each; where a hole is, the dense
@@ -234,10 +226,10 @@ def _onto_points(
     turned = normal - found[:, 1:2] * first - found[:, 2:3] * second
     turned /= np.linalg.norm(turned, axis=1, keepdims=True)
     turned = np.where((sure & (np.einsum("vx,vx->v", turned, normal) > 0.7))[:, None], turned, normal)
-    return x, _agreeing(x, coarse, turned)
+    return x, _correct_normals(x, coarse, turned)
 
 
-def _agreeing(
+def _correct_normals(
     x: Float[np.ndarray, "v 3"], coarse: Coarse, normals: Float[np.ndarray, "v 3"]
 ) -> Float[np.ndarray, "v 3"]:
     """The normals, but where a face would bend back on itself under one.

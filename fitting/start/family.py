@@ -62,12 +62,12 @@ def place_member(
     for mode in range(min(_LEADING, len(modes))):
         starts += [way * _AWAY * np.eye(len(modes))[mode] for way in (-1, 1)]
     found = [_search(place, scores, mean, modes, placed.faces, points, _FIRST_STEPS) for scores in starts]
-    off = [_pair(place.put(mean + np.tensordot(scores, modes, 1)), placed.faces, points) for place, scores in found]
+    off = [_pair(place.apply(mean + np.tensordot(scores, modes, 1)), placed.faces, points) for place, scores in found]
     near = 3 * min(np.median(pairs.distances) for pairs in off) + np.finfo(float).tiny
     # Source: Torr and Zisserman 2000 (MSAC): farther points have no say.
     best = int(np.argmin([np.mean(np.minimum(pairs.distances / near, 1.0) ** 2) for pairs in off]))
     place, scores = _search(*found[best], mean, modes, placed.faces, points, _STEPS)
-    return Member(place.put(mean + np.tensordot(scores, modes, 1)), scores)
+    return Member(place.apply(mean + np.tensordot(scores, modes, 1)), scores)
 
 
 class _Place(NamedTuple):
@@ -83,7 +83,7 @@ class _Place(NamedTuple):
         turn = Rotation.align_vectors(there - there.mean(axis=0), shape - shape.mean(axis=0))[0]
         return cls(turn.as_matrix(), there.mean(axis=0) - turn.apply(shape.mean(axis=0)))
 
-    def put(self, x: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
+    def apply(self, x: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
         """Positions there."""
         return x @ self.turn.T + self.shift
 
@@ -127,7 +127,7 @@ def _search(
 ) -> tuple[_Place, Float[np.ndarray, "k"]]:
     """Where one start leads."""
     counted, size = min(1.0, len(mean) / len(points)), float(np.linalg.norm(np.ptp(mean, axis=0)))
-    there = place.put(mean + np.tensordot(scores, modes, 1))
+    there = place.apply(mean + np.tensordot(scores, modes, 1))
     for _ in range(steps):
         pairs = _pair(there, faces, points)
         scale = _MAD * float(np.median(pairs.distances)) + _ROUNDING * size
@@ -147,7 +147,7 @@ def _search(
         turn = Rotation.from_rotvec(step[3:6]).as_matrix()
         place = _Place(turn @ place.turn, turn @ (place.shift - middle) + middle + step[:3])
         scores = scores + step[6:]
-        before, there = there, place.put(mean + np.tensordot(scores, modes, 1))
+        before, there = there, place.apply(mean + np.tensordot(scores, modes, 1))
         if np.abs(there - before).max() < _MOVED * size:
             break
     return place, scores

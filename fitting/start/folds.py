@@ -54,35 +54,35 @@ class Folds(eqx.Module):
         slot = np.arange(len(sides.face)) - np.searchsorted(sides.face, sides.face)
         self.edges_of[sides.face, slot] = row_of_edge[sides.edge]
 
-    def turned_over(self, vertices: Float[AnyArray, "v 3"], xp: Any = np) -> Bool[AnyArray, "f"]:
+    def find_turned_over(self, vertices: Float[AnyArray, "v 3"], xp: Any = np) -> Bool[AnyArray, "f"]:
         """Faces that are folded onto the faces beside them at most of their edges.
 
         Of faces that meet at one edge only, either may be the one.
         """
-        back = self._per_face(self._folded(vertices, xp), xp)
+        back = self._count_per_face(self._find_folded(vertices, xp), xp)
         return (back >= 2) & (2 * back > (self.edges_of >= 0).sum(axis=1))
 
-    def upside_down(self, vertices: Float[np.ndarray, "v 3"]) -> Bool[np.ndarray, "f"]:
+    def find_upside_down(self, vertices: Float[np.ndarray, "v 3"]) -> Bool[np.ndarray, "f"]:
         """Those of them that most of the faces at their corners are turned away from, as at no rim of a thin part."""
         normals, sides = self._normals(vertices, np), self.sides
         own = normals[sides.face]
         at_corner = np.stack([np.bincount(sides.start, axis, self.n_vertices) for axis in own.T], axis=1)
         others = np.bincount(sides.start, minlength=self.n_vertices) - 1
         agree = np.bincount(sides.face, np.sum((at_corner[sides.start] - own) * own, axis=1))
-        return self.turned_over(vertices) & (agree < _TURNED * np.bincount(sides.face, others[sides.start]))
+        return self.find_turned_over(vertices) & (agree < _TURNED * np.bincount(sides.face, others[sides.start]))
 
     def _normals(self, vertices: Float[AnyArray, "v 3"], xp: Any) -> Float[AnyArray, "f 3"]:
         a, b, c, d = (vertices[self.corners[:, i]] for i in range(4))
         normals = xp.cross(c - a, d - b)  # of a triangle, whose last corners are one, cross(c - a, c - b)
         return normals / xp.maximum(xp.sqrt(xp.sum(normals**2, axis=1, keepdims=True)), np.finfo(normals.dtype).tiny)
 
-    def _folded(self, vertices: Float[AnyArray, "v 3"], xp: Any) -> Bool[AnyArray, "e"]:
+    def _find_folded(self, vertices: Float[AnyArray, "v 3"], xp: Any) -> Bool[AnyArray, "e"]:
         """Edges at which two faces are folded onto each other."""
         normals = self._normals(vertices, xp)
         one, other = normals[self.beside[:, 0]], normals[self.beside[:, 1]]
         return xp.sum(one * other, axis=1) < _FOLDED
 
-    def _per_face(self, edges: Bool[AnyArray, "e"], xp: Any = np) -> Int[AnyArray, "f"]:
+    def _count_per_face(self, edges: Bool[AnyArray, "e"], xp: Any = np) -> Int[AnyArray, "f"]:
         """How many of these edges each face has."""
         edges = xp.concatenate([edges, xp.zeros(1, bool)])  # the last, for edges that have one face alone
         return edges[self.edges_of].sum(axis=1)
@@ -96,7 +96,7 @@ class Folds(eqx.Module):
         marks = jnp.broadcast_to(faces[:, None], self.corners.shape)
         return jnp.zeros(self.n_vertices, bool).at[jnp.asarray(self.corners)].max(marks)
 
-    def unfolded(self, vertices: Float[np.ndarray, "v 3"], may_move: Bool[np.ndarray, "v"]) -> Float[np.ndarray, "v 3"]:
+    def unfold(self, vertices: Float[np.ndarray, "v 3"], may_move: Bool[np.ndarray, "v"]) -> Float[np.ndarray, "v 3"]:
         """The vertices; those of faces upside down between their neighbours, where that leaves fewer such faces.
 
         Those beside them follow where they have to: a vertex may lie on the far side of a thin triangle that is itself
@@ -105,11 +105,11 @@ class Folds(eqx.Module):
         around = averages(self.sides.edges, self.n_vertices)
         on_boundary = np.zeros(self.n_vertices, bool)
         on_boundary[self.sides.edges[np.bincount(self.sides.edge) == 1]] = True  # its middles lie within the mesh
-        turned = self.upside_down(vertices)
-        of_rims = self._folded(vertices, np) & ~turned[self.beside].any(axis=1)
+        turned = self.find_upside_down(vertices)
+        of_rims = self._find_folded(vertices, np) & ~turned[self.beside].any(axis=1)
 
         def folds_of(x: Float[np.ndarray, "v 3"]) -> Bool[np.ndarray, "v"]:
-            return self.corners_of(self._per_face(self._folded(x, np) & ~of_rims) > 0)
+            return self.corners_of(self._count_per_face(self._find_folded(x, np) & ~of_rims) > 0)
 
         x = best = vertices
         hurt, moving, fewest = self.corners_of(turned), np.zeros(self.n_vertices, bool), np.sum(folds_of(vertices))
@@ -122,17 +122,17 @@ class Folds(eqx.Module):
             if np.sum(folded) < fewest:
                 best, fewest = x, np.sum(folded)
             hurt = folded & (moving | (around @ moving > 0))
-        return best if np.sum(self.upside_down(best)) < np.sum(turned) else vertices
+        return best if np.sum(self.find_upside_down(best)) < np.sum(turned) else vertices
 
 
-def unfolded_start(topology: js.Topology, control: js.Control, may_move: Bool[np.ndarray, "v"] | bool) -> js.Control:
+def unfold_start(topology: js.Topology, control: js.Control, may_move: Bool[np.ndarray, "v"] | bool) -> js.Control:
     """The control mesh without faces upside down, as far as vertices that are free can mend it; it warns of them."""
     folds, given = Folds(topology), np.asarray(control.vertices, np.float64)
-    turned = folds.upside_down(given)
+    turned = folds.find_upside_down(given)
     if not turned.any():
         return control
-    mended = folds.unfolded(given, np.broadcast_to(may_move, len(given)))
-    n_stay = np.sum(turned & folds.upside_down(mended))
+    mended = folds.unfold(given, np.broadcast_to(may_move, len(given)))
+    n_stay = np.sum(turned & folds.find_upside_down(mended))
     unmended = n_stay == np.sum(turned)
     if unmended:
         done = "They stay, as their vertices are fixed, on a boundary, or in a knot: look at the surface there."

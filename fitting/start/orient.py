@@ -71,6 +71,6 @@ def orient(
     return normals * signs[:, None]
 
 
-def flipped(normals: Float[np.ndarray, "p 3"], against: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, "p"]:
+def find_flipped(normals: Float[np.ndarray, "p 3"], against: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, "p"]:
     """Which normals point against the other ones."""
     return np.einsum("px,px->p", normals, against) < 0

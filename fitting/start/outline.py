@@ -5,7 +5,7 @@ from scipy.spatial import KDTree
 
 from ..scan.scan import Scan
 from .cloud import LEAST_POINTS, Cloud
-from .parts import Part, nearest_piece, some_of
+from .parts import Part, nearest_piece, take_points
 from .reconstruct import separate
 from .remesh import Dense
 
@@ -29,7 +29,7 @@ def parts_of_outline(scan: Scan, cloud: Cloud) -> list[Part]:
     for i, dense in enumerate(pieces):
         own = nearest == i
         if own.sum() >= LEAST_POINTS or not parts:
-            parts.append(Part(some_of(cloud, own), dense, dense.topology()))
+            parts.append(Part(take_points(cloud, own), dense, dense.topology()))
     return parts
 
 

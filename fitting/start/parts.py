@@ -41,7 +41,7 @@ def find_parts(cloud: Cloud, closed: bool | None) -> list[Part]:
         of_labels: list[Part] = []
         for one in np.unique(cloud.label[cloud.label >= 0]):
             try:
-                of_labels += find_parts(some_of(cloud, cloud.label == one)._replace(label=None), closed)
+                of_labels += find_parts(take_points(cloud, cloud.label == one)._replace(label=None), closed)
             except ScanError:
                 continue  # too small, or no surface
         if of_labels:
@@ -49,7 +49,7 @@ def find_parts(cloud: Cloud, closed: bool | None) -> list[Part]:
     parts: list[Part] = []
     if len(cloud.points) < LEAST_POINTS:
         raise ScanError(f"{len(cloud.points)} points are too few for a surface; {LEAST_POINTS} are the least.")
-    rest, n = _turned_outwards(cloud) if cloud.given else cloud, len(cloud.points)
+    rest, n = _turn_outwards(cloud) if cloud.given else cloud, len(cloud.points)
     found = reconstruct(rest, closed)
     while len(parts) < _MOST_PARTS:
         own = nearest_piece(found.cloud.points, found.cloud.reach, found.pieces)
@@ -59,8 +59,8 @@ def find_parts(cloud: Cloud, closed: bool | None) -> list[Part]:
             it = own == i
             if it.sum() >= LEAST_POINTS or not parts:
                 topology = found.topology if i == 0 else dense.topology()
-                part = Part(some_of(found.cloud, it), dense, topology)
-                parts.append(part if cloud.given else _outside_out(part))
+                part = Part(take_points(found.cloud, it), dense, topology)
+                parts.append(part if cloud.given else _orient_outwards(part))
         beside = nearest_piece(rest.points, rest.reach, found.pieces) < 0
         if beside.sum() < max(_MORE * n, LEAST_POINTS):
             break
@@ -73,7 +73,7 @@ def find_parts(cloud: Cloud, closed: bool | None) -> list[Part]:
     return sorted(parts, key=lambda part: -part.dense.areas.sum())
 
 
-def some_of(cloud: Cloud, chosen: Bool[np.ndarray, "p"]) -> Cloud:
+def take_points(cloud: Cloud, chosen: Bool[np.ndarray, "p"]) -> Cloud:
     """The chosen points, with what is known of each but its label."""
     points, normals, reach = (rows[chosen] for rows in (cloud.points, cloud.normals, cloud.reach))
     return cloud._replace(points=points, normals=normals, reach=reach)
@@ -117,7 +117,7 @@ def nearest_piece(points: Float[np.ndarray, "p 3"], reach: Float[np.ndarray, "p"
     return np.where(distance <= _NEAR * np.maximum(reach, np.median(reach)), owner[row], -1)
 
 
-def _outside_out(part: Part) -> Part:
+def _orient_outwards(part: Part) -> Part:
     """The same with its outside out: of two objects at once, one may come out turned against the other."""
     a, b, c = np.moveaxis(part.dense.vertices[part.dense.faces] - part.dense.vertices.mean(axis=0), 1, 0)
     if not part.topology.is_closed or np.einsum("tx,tx->", a, np.cross(b, c)) >= 0:
@@ -126,7 +126,7 @@ def _outside_out(part: Part) -> Part:
     return Part(part.cloud._replace(normals=-part.cloud.normals), dense, part.topology)
 
 
-def _turned_outwards(cloud: Cloud) -> Cloud:
+def _turn_outwards(cloud: Cloud) -> Cloud:
     """Normals of a closed scan that all point inwards are turned; an open one may well be seen from inside."""
     if np.sum(cloud.areas[:, None] * (cloud.points - cloud.points.mean(axis=0)) * cloud.normals) > 0:
         return cloud

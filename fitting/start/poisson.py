@@ -22,16 +22,17 @@ class Implicit(NamedTuple):
     origin: Float[np.ndarray, "3"]
     cell: float
 
-    def at(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p"]:
+    def evaluate(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p"]:
         """Values between the nodes, trilinear."""
         return scipy.ndimage.map_coordinates(
             self.values, ((points - self.origin) / self.cell).T, order=1, mode="nearest"
         )
 
-    def outward(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+    def outward_vectors(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
         """Down the gradient, by differences over a cell; not of unit length."""
         steps = self.cell * np.eye(3)
-        return np.stack([self.at(points - step) - self.at(points + step) for step in steps], axis=1) / (2 * self.cell)
+        falls = [self.evaluate(points - step) - self.evaluate(points + step) for step in steps]
+        return np.stack(falls, axis=1) / (2 * self.cell)
 
 
 def poisson(
@@ -68,7 +69,7 @@ def poisson(
     spectrum[0, 0, 0] = 0
     values = -np.asarray(idctn(spectrum))
     found = Implicit(values, origin, cell)
-    return found._replace(values=values - np.float32(_median(found.at(points), areas)))
+    return found._replace(values=values - np.float32(_median(found.evaluate(points), areas)))
 
 
 def _spread(

@@ -47,16 +47,16 @@ def reconstruct(cloud: Cloud, closed: bool | None) -> Reconstruction:
 
     Noise and stray points make handles as narrow as the grid; a true one is wider.
     """
-    return _smoothed_by(_SMOOTHER, cloud, closed)
+    return _smooth_by(_SMOOTHER, cloud, closed)
 
 
 def reconstruct_smoothly(cloud: Cloud, closed: bool | None) -> Reconstruction:
     """The surface at so much smoothing that hardly a handle is left."""
-    return _smoothed_by((_SMOOTHEST,), cloud, closed)
+    return _smooth_by((_SMOOTHEST,), cloud, closed)
 
 
-def _smoothed_by(factors: tuple[float, ...], cloud: Cloud, closed: bool | None) -> Reconstruction:
-    cloud, cell = _without_strays(cloud)
+def _smooth_by(factors: tuple[float, ...], cloud: Cloud, closed: bool | None) -> Reconstruction:
+    cloud, cell = _drop_strays(cloud)
     best = None
     for factor in factors:
         settled, implicit = settle(cloud, cell, factor)
@@ -78,13 +78,13 @@ def is_closed(cloud: Cloud) -> bool:
     return _is_closed(settled, _contour(implicit, shut=True), KDTree(settled.points))
 
 
-def _without_strays(cloud: Cloud) -> tuple[Cloud, float]:
+def _drop_strays(cloud: Cloud) -> tuple[Cloud, float]:
     """The cloud less what is far off its surface, and the grid's spacing for what is left."""
     cell = max(float(np.ptp(cloud.points, axis=0).max()) / _CELLS, 0.8 * cloud.spacing, 0.5 * cloud.noise)
     cloud, implicit = settle(cloud, 2 * cell)
     # What was an outlier among outliers shows once there is a surface.
-    slope = np.linalg.norm(implicit.outward(cloud.points), axis=1)
-    off = np.abs(implicit.at(cloud.points)) / np.maximum(slope, 0.1 * np.median(slope))
+    slope = np.linalg.norm(implicit.outward_vectors(cloud.points), axis=1)
+    off = np.abs(implicit.evaluate(cloud.points)) / np.maximum(slope, 0.1 * np.median(slope))
     wrong = off > max(_FAR_OFF * _MAD * float(np.median(off)), cell)
     _, near = nearest_rows(KDTree(cloud.points), cloud.points, min(2 * NEIGHBOUR, len(cloud.points)))
     keep = ~wrong | (wrong[near].mean(axis=1) > 0.5)  # many side by side are a place that is too sharp for this surface
@@ -103,9 +103,9 @@ def _pieces_of_surface(cloud: Cloud, implicit: Implicit, closed: bool | None) ->
 
 
 def _is_closed(cloud: Cloud, shut: Dense, tree: KDTree) -> bool:
-    if shut.areas[_beyond_view(cloud, shut)].sum() > _BEYOND * shut.areas.sum():
+    if shut.areas[_find_beyond_view(cloud, shut)].sum() > _BEYOND * shut.areas.sum():
         return False
-    far = _made_up(shut, cloud, tree)[shut.faces].all(axis=1)
+    far = _find_made_up(shut, cloud, tree)[shut.faces].all(axis=1)
     return bool(shut.areas[far].sum() < _OPEN * shut.areas.sum())
 
 
@@ -125,17 +125,17 @@ def _contour(implicit: Implicit, shut: bool) -> Dense:
     if found.n_cells == 0:
         raise ScanError("no surface: the points are scattered in space. Was the right file read?")
     vertices, faces = np.asarray(found.points, np.float64), np.asarray(found.regular_faces, np.int32)
-    vertices, faces = _merged(vertices, faces)
+    vertices, faces = _merge_doubled(vertices, faces)
     dense = Dense(vertices, faces)
     middle = vertices[faces].mean(axis=1)
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     # Outwards is down: of the two windings of the library, the one that the function asks for.
-    if np.sum(implicit.outward(middle) * np.cross(b - a, c - a)) < 0:
+    if np.sum(implicit.outward_vectors(middle) * np.cross(b - a, c - a)) < 0:
         dense = Dense(vertices, faces[:, ::-1])
     return dense
 
 
-def _merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _merge_doubled(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Without doubled vertices and what falls flat with them."""
     _, first, at = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
     faces = at.ravel()[faces]
@@ -143,13 +143,13 @@ def _merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     return vertices[first], faces
 
 
-def _made_up(dense: Dense, cloud: Cloud, tree: KDTree) -> Bool[np.ndarray, "v"]:
+def _find_made_up(dense: Dense, cloud: Cloud, tree: KDTree) -> Bool[np.ndarray, "v"]:
     """Vertices that no point is near to, by the density of the points there."""
     distance, row = tree.query(dense.vertices, workers=-1)
     return distance > _MADE_UP * np.maximum(cloud.reach[row], np.median(cloud.reach))
 
 
-def _beyond_view(cloud: Cloud, dense: Dense) -> Bool[np.ndarray, "t"]:
+def _find_beyond_view(cloud: Cloud, dense: Dense) -> Bool[np.ndarray, "t"]:
     """Faces past the end of the image that the scan was made of."""
     if cloud.view is None:
         return np.zeros(len(dense.faces), bool)
@@ -159,8 +159,8 @@ def _beyond_view(cloud: Cloud, dense: Dense) -> Bool[np.ndarray, "t"]:
 
 def _cut_back(dense: Dense, cloud: Cloud, tree: KDTree) -> Dense:
     """Without what is made up in large pieces; small gaps stay bridged."""
-    far, beyond = _made_up(dense, cloud, tree), _beyond_view(cloud, dense)
-    gone = _large(dense, np.asarray(far[dense.faces].all(axis=1)), _BRIDGED) | _large(dense, beyond, _BEYOND)
+    far, beyond = _find_made_up(dense, cloud, tree), _find_beyond_view(cloud, dense)
+    gone = _find_large(dense, np.asarray(far[dense.faces].all(axis=1)), _BRIDGED) | _find_large(dense, beyond, _BEYOND)
     away = np.zeros(len(dense.vertices), bool)
     away[dense.faces[gone]] = True
     if not away.any():
@@ -171,11 +171,11 @@ def _cut_back(dense: Dense, cloud: Cloud, tree: KDTree) -> Dense:
     to_gone = KDTree(dense.vertices[away]).query(dense.vertices, workers=-1)[0]
     out = away | ((to_gone < _MADE_UP * reach) & (distance > _RIM * reach + cloud.noise))
     kept = ~out[dense.faces].any(axis=1)
-    off = _large(dense, ~kept, _BRIDGED, always=gone)
-    return Dense(dense.vertices, _without_pinches(dense.faces[~off]))
+    off = _find_large(dense, ~kept, _BRIDGED, always=gone)
+    return Dense(dense.vertices, _drop_pinches(dense.faces[~off]))
 
 
-def _large(
+def _find_large(
     dense: Dense, chosen: Bool[np.ndarray, "t"], share: float, always: Bool[np.ndarray, "t"] | None = None
 ) -> Bool[np.ndarray, "t"]:
     """Those of the chosen faces whose piece has more than a share of the area of the rest, or some of `always`."""
@@ -185,7 +185,7 @@ def _large(
     return np.isin(piece, large if always is None else np.concatenate([large, piece[always]]))
 
 
-def _without_pinches(faces: Int[np.ndarray, "t 3"]) -> Int[np.ndarray, "s 3"]:
+def _drop_pinches(faces: Int[np.ndarray, "t 3"]) -> Int[np.ndarray, "s 3"]:
     """Faces less those at vertices where the rim touches itself, which is no manifold."""
     while True:
         sides = half_edges({3: faces, 4: np.zeros((0, 4), np.int64)})

@@ -61,22 +61,22 @@ def coarsen(dense: Dense, n_triangles: int, topology: MeshTopology) -> Coarse | 
     for factor in _TRIES:
         # Of a closed mesh F = 2 (V - euler); a rim has its vertices at half the faces.
         n_vertices = max(4, round(factor * share * (n_triangles / 2 + euler)))
-        found = _clustered(dense, n_vertices)
+        found = _cluster(dense, n_vertices)
         if share == 1.0 and abs(len(found.faces[3]) / n_triangles - factor) > _COUNT and len(found.faces[3]):
             share = min(factor * n_triangles / len(found.faces[3]), 2.0)
             n_vertices = round(share * n_vertices)
-            found = _clustered(dense, n_vertices)
+            found = _cluster(dense, n_vertices)
         if _is_whole(found, n_vertices, topology):
             return found
     for finer in _FINER:
         # Deep folds lie closer than a cluster is wide: smaller ones keep the sheets apart, and are merged with care.
         n_vertices = round(finer * max(n_triangles / 2 + euler, n_triangles / 4))
-        found = _clustered(dense, n_vertices)
+        found = _cluster(dense, n_vertices)
         if _is_whole(found, n_vertices, topology):
             break
     else:
         return None
-    found = _collapsed(found, n_triangles)
+    found = _collapse(found, n_triangles)
     return found if len(found.faces[3]) <= _AT_MOST * n_triangles else None
 
 
@@ -88,7 +88,7 @@ def _is_whole(found: Coarse, n_vertices: int, topology: MeshTopology) -> bool:
     return face_topology(found.faces) == topology
 
 
-def _clustered(dense: Dense, n_vertices: int) -> Coarse:
+def _cluster(dense: Dense, n_vertices: int) -> Coarse:
     """One vertex for each of `n_vertices` clusters of equal area. Valette & Chassery 2004, by pyacvd."""
     import pyacvd
 
@@ -109,7 +109,7 @@ def _clustered(dense: Dense, n_vertices: int) -> Coarse:
     return _largest_part(_compact(centres, corners))
 
 
-def _collapsed(mesh: Coarse, n_triangles: int) -> Coarse:
+def _collapse(mesh: Coarse, n_triangles: int) -> Coarse:
     """Edges collapsed one by one to their middle, the shortest first; none that would change the topology.
 
     The link condition: the ends have no neighbours in common but the corners opposite of the edge (Dey et al. 1999).
@@ -212,10 +212,10 @@ def _is_manifold(mesh: Coarse) -> bool:
     # Corners at a vertex, less the pairs that its inner edges join: the number of its fans, where none is a ring.
     inner = np.bincount(sides.edges[counts == 2].ravel(), minlength=n)
     corners = np.bincount(sides.start, minlength=n)
-    return bool((counts <= 2).all() and (rim <= 1).all() and ((corners - inner) == rim).all() and not _pinched(mesh))
+    return bool((counts <= 2).all() and (rim <= 1).all() and ((corners - inner) == rim).all() and not _is_pinched(mesh))
 
 
-def _pinched(mesh: Coarse) -> bool:
+def _is_pinched(mesh: Coarse) -> bool:
     """Whether two rings of faces touch in a vertex: its neighbours then fall into two cycles."""
     sides = half_edges(mesh.faces)
     order = np.argsort(sides.start, kind="stable")
@@ -239,7 +239,7 @@ def _pinched(mesh: Coarse) -> bool:
 # -------------------------------------------------------------------------------------------------------------- quads
 
 
-def paired(mesh: Coarse) -> Coarse:
+def pair_triangles(mesh: Coarse) -> Coarse:
     """Triangles paired to quads, as square as they can be; those that stay over, on an open mesh alone, stay triangles.
 
     A closed mesh of triangles can always be paired without a rest (Petersen 1891), by a matching of the largest weight.
@@ -265,7 +265,7 @@ def paired(mesh: Coarse) -> Coarse:
     chosen = np.array(sorted(graph.get_edge_data(a, b) for a, b in pairs), dtype=int)
     left = np.ones(len(triangles), bool)
     left[sides.face[one[chosen]]] = left[sides.face[two[chosen]]] = False
-    return _without_doublets(Coarse(mesh.vertices, {3: triangles[left], 4: quads[chosen]}))
+    return _merge_doublets(Coarse(mesh.vertices, {3: triangles[left], 4: quads[chosen]}))
 
 
 def _squareness(mesh: Coarse, quads: Int[np.ndarray, "q 4"]) -> Float[np.ndarray, "q"]:
@@ -280,7 +280,7 @@ def _squareness(mesh: Coarse, quads: Int[np.ndarray, "q 4"]) -> Float[np.ndarray
     return np.where((turn > 0).all(axis=1), np.clip(1 - worst / 90, 0, 1), 0)
 
 
-def _without_doublets(mesh: Coarse) -> Coarse:
+def _merge_doublets(mesh: Coarse) -> Coarse:
     """Two quads that share both sides at a vertex become the one around it."""
     quads = [tuple(row) for row in mesh.faces[4].tolist()]
     while True:
@@ -307,7 +307,7 @@ def _without_doublets(mesh: Coarse) -> Coarse:
 # ---------------------------------------------------------------------------------------------------------- relaxation
 
 
-def relaxed(mesh: Coarse, dense: Dense, rounds: int = _RELAXED) -> Coarse:
+def relax(mesh: Coarse, dense: Dense, rounds: int = _RELAXED) -> Coarse:
     """Vertices moved along the dense surface to the middle of their neighbours; those of a rim along the rim."""
     sides = half_edges(mesh.faces)
     n = len(mesh.vertices)
@@ -321,7 +321,7 @@ def relaxed(mesh: Coarse, dense: Dense, rounds: int = _RELAXED) -> Coarse:
     x = mesh.vertices.copy()
     for _ in range(rounds):
         moved = np.where(on_rim[:, None], x + 0.5 * (along @ x - x), x + 0.5 * (inner @ x - x))
-        x = _onto(moved, dense.vertices, normals, tree)
+        x = _move_onto(moved, dense.vertices, normals, tree)
         if edge_of_rim is not None:
             x[on_rim] = dense_rim[edge_of_rim.query(moved[on_rim])[1]]
     return Coarse(x, mesh.faces)
@@ -339,7 +339,7 @@ def _smooth_rim(dense: Dense) -> Float[np.ndarray, "r 3"]:
     return x
 
 
-def _onto(
+def _move_onto(
     x: Float[np.ndarray, "n 3"], vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"], tree: KDTree
 ) -> Float[np.ndarray, "n 3"]:
     row = tree.query(x)[1]

@@ -26,7 +26,7 @@ def make_symmetric(mesh: js.ControlMesh) -> js.ControlMesh:
     Raises:
         ValueError: no half is left, or the two halves do not make a manifold mesh.
     """
-    mesh = mesh.triangulated()
+    mesh = mesh.triangulate()
     middle, normal = find_mirror_plane(mesh)
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces[3])
     edges = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]

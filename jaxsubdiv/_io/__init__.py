@@ -16,11 +16,12 @@ from numpy.typing import ArrayLike
 
 from .._mesh import ControlMesh
 from ..errors import MeshError, check_scale, name_rows
-from ..files import replacing
+from ..extras import import_extra
+from ..files import replace_file
 from ..frames import Frame
 from ..markups import read_control_points
 from . import _arrays, _digitiser, _freesurfer, _gifti, _glb, _markups, _obj, _off, _pcd, _ply, _stl, _table, _vtk, _vtp
-from ._contents import Contents, VertexData, doubles, library, warn
+from ._contents import Contents, VertexData, as_double, warn
 from ._frame import find_space
 
 __all__ = ["PointCloud", "Surface", "check_can_write", "read_frame", "read_mesh", "read_points", "write_mesh"]
@@ -120,7 +121,7 @@ def read_mesh(path: str | os.PathLike[str], *, scale: float | int = 1.0, check: 
     Args:
         path: the file.
         scale: factor for the coordinates: 1000 turns metres into mm. A unit is never guessed.
-        check: False puts off the checks of `ControlMesh`, so that `repaired()` can be called.
+        check: False puts off the checks of `ControlMesh`, so that `repair()` can be called.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -132,7 +133,7 @@ def read_mesh(path: str | os.PathLike[str], *, scale: float | int = 1.0, check: 
     if format_.read_mesh is None:
         raise MeshError(f"{path.name}: {path.suffix} files hold points without faces. Read it with `read_points`.")
     check_scale(scale)
-    contents = _told_unit(path, format_.read_mesh(path), scale)
+    contents = _warn_of_unit(path, format_.read_mesh(path), scale)
     if contents.faces is None:
         raise MeshError(f"{path.name}: it holds points but no faces. Read it with `read_points`.")
     vertices = _numbers(path.name, "vertices", contents.vertices, (None, 3))
@@ -140,9 +141,9 @@ def read_mesh(path: str | os.PathLike[str], *, scale: float | int = 1.0, check: 
     normals = None if normals is None else _numbers(path.name, "normals", normals, (len(vertices), 3))
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # areas of faces as large as numbers can be
-            return ControlMesh(_scaled(vertices, scale), contents.faces, normals, check=check, regions=contents.regions)
+            return ControlMesh(_scale(vertices, scale), contents.faces, normals, check=check, regions=contents.regions)
     except MeshError as error:
-        mend = " Read it with check=False to get there." if "repaired()" in str(error) else ""
+        mend = " Read it with check=False to get there." if "repair()" in str(error) else ""
         raise MeshError(f"{path.name}: {error}{mend}") from None
 
 
@@ -185,8 +186,8 @@ def read_labelled_points(
     """The points of `read_points`, and columns of text beside them: those of the names that a table's header has."""
     path, format_ = _open(path)
     check_scale(scale)
-    contents = _told_unit(path, format_.read_points(path), scale)
-    points = _scaled(_numbers(path.name, "points", contents.vertices, (None, 3)), scale)
+    contents = _warn_of_unit(path, format_.read_points(path), scale)
+    points = _scale(_numbers(path.name, "points", contents.vertices, (None, 3)), scale)
     n = len(points)
     normals = None if contents.normals is None else _numbers(path.name, "normals", contents.normals, (n, 3))
     weights = None if contents.weights is None else _numbers(path.name, "weights", contents.weights, (n,))
@@ -201,8 +202,8 @@ def read_labelled_points(
         )
     cloud = PointCloud(
         points[kept],
-        None if normals is None else _present(path, normals[kept]),
-        None if weights is None else _finite(path.name, "weights", weights[kept]),
+        None if normals is None else _fill_normals(path, normals[kept]),
+        None if weights is None else _check_finite(path.name, "weights", weights[kept]),
     )
     texts = {name: contents.texts[name] for name in names if name in contents.texts}
     return cloud, {
@@ -214,7 +215,7 @@ def read_frame(path: str | os.PathLike[str]) -> Frame | None:
     """What a file of points or of a mesh says its axes are: "LPS" or "RAS"; None where it does not say.
 
     3D Slicer writes `SPACE=LPS` into comments of `.ply`, `.obj`, `.stl` and `.vtk` files, and its control points
-    (`.mrk.json`, `.fcsv`) name their frame. Nothing is turned by it; see `jaxsubdiv.frames.in_frame`.
+    (`.mrk.json`, `.fcsv`) name their frame. Nothing is turned by it; see `jaxsubdiv.frames.convert_frame`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -224,7 +225,7 @@ def read_frame(path: str | os.PathLike[str]) -> Frame | None:
     return read_control_points(path).frame if format_ is _MARKUPS else find_space(path)
 
 
-def _told_unit(path: Path, contents: Contents, scale: float | int) -> Contents:
+def _warn_of_unit(path: Path, contents: Contents, scale: float | int) -> Contents:
     """The contents, after a warning where their format has a unit of its own and no scale was given."""
     if contents.usual_unit is not None and scale == 1:
         unit, to_mm = contents.usual_unit
@@ -232,7 +233,7 @@ def _told_unit(path: Path, contents: Contents, scale: float | int) -> Contents:
     return contents
 
 
-def _present(path: Path, normals: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"] | None:
+def _fill_normals(path: Path, normals: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"] | None:
     """The normals, zero where they are not finite; None where no point has one."""
     finite = _finite_rows(normals)
     if not finite.all():
@@ -283,14 +284,14 @@ def write_mesh(
     path = Path(path)
     if path.is_dir():
         raise MeshError(f"{path}: this is a folder. Name a file in it.")
-    format_, write = _writable(path)
+    format_, write = _check_writable(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, "the folder does not exist, create it first", str(path.parent))
     contents = _contents(path, mesh)._replace(frame=frame)
     data = _vertex_data(vertex_data or {}, len(contents.vertices))
     if data:
         _check_holds_data(path, format_)
-    with replacing(path) as unfinished:
+    with replace_file(path) as unfinished:
         write(unfinished, contents, data)
 
 
@@ -306,14 +307,14 @@ def check_can_write(path: str | os.PathLike[str], *, vertex_data: bool = False) 
         ImportError: a library of the extra `io` is not installed.
     """
     path = Path(path)
-    format_, _ = _writable(path)
+    format_, _ = _check_writable(path)
     if vertex_data:
         _check_holds_data(path, format_)
     if format_.library is not None:
-        library(format_.library, f"{path.suffix} files")
+        import_extra(format_.library, "io", f"{path.suffix} files")
 
 
-def _writable(path: Path) -> tuple[_Format, Callable[[Path, Contents, VertexData], None]]:
+def _check_writable(path: Path) -> tuple[_Format, Callable[[Path, Contents, VertexData], None]]:
     format_ = _format(path)
     if format_.write is None:
         held = "points without faces" if format_.read_mesh is None else "meshes that are only read"
@@ -367,10 +368,10 @@ def _suffixes(able_to: str) -> str:
 
 def _contents(path: Path, mesh: Surface) -> Contents:
     """The arrays of what is to be written, checked as far as a reader must be able to rely on them."""
-    vertices = _finite(path.name, "vertices", _numbers(path.name, "vertices", mesh.vertices, (None, 3)))
+    vertices = _check_finite(path.name, "vertices", _numbers(path.name, "vertices", mesh.vertices, (None, 3)))
     normals = mesh.normals
     if normals is not None:
-        normals = _finite(path.name, "normals", _numbers(path.name, "normals", normals, (len(vertices), 3)))
+        normals = _check_finite(path.name, "normals", _numbers(path.name, "normals", normals, (len(vertices), 3)))
     faces = {size: np.asarray(mesh.faces.get(size, np.zeros((0, size), int))) for size in (3, 4)}
     if set(mesh.faces) - {3, 4} or any(
         block.dtype.kind not in "iu" or block.shape != (len(block), size) for size, block in faces.items()
@@ -411,10 +412,10 @@ def _numbers(file: str, name: str, values: Any, shape: tuple[int | None, ...]) -
             f"{file}: `{name}` must be numbers of the shape [{wanted}]; got {array.dtype} of the shape "
             f"{list(array.shape)}."
         )
-    return doubles(array)
+    return as_double(array)
 
 
-def _finite(file: str, name: str, array: np.ndarray) -> np.ndarray:
+def _check_finite(file: str, name: str, array: np.ndarray) -> np.ndarray:
     """The array, or an error with the rows that are not finite."""
     bad = np.flatnonzero(~_finite_rows(array))
     if len(bad):
@@ -426,7 +427,7 @@ def _finite_rows(array: np.ndarray) -> Bool[np.ndarray, "n"]:
     return np.asarray(np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
 
 
-def _scaled(array: np.ndarray, scale: float | int) -> np.ndarray:
+def _scale(array: np.ndarray, scale: float | int) -> np.ndarray:
     # What passes the largest number is not finite, and told as such; NaN of some makes warn of any arithmetic.
     with np.errstate(over="ignore", invalid="ignore"):
         return array * scale

@@ -25,7 +25,7 @@ def read_npz(path: Path) -> Contents:
     for vertices, normals, faces in _MESHES:
         if (found := arrays.get(vertices)) is not None:
             blocks = [block for name in faces if (block := arrays.get(name)) is not None]
-            return Contents(found, _by_columns(path, blocks) if blocks else None, arrays.get(normals))
+            return Contents(found, _sort_by_columns(path, blocks) if blocks else None, arrays.get(normals))
     raise MeshError(
         f"{path.name}: a mesh needs the arrays `control_points` and `control_faces`, or `vertices` with `faces`, "
         f"`triangles` or `quads`. It has {name_rows(arrays) or 'none'}."
@@ -65,7 +65,7 @@ def _load(path: Path, wanted: set[str]) -> dict[str, np.ndarray | None]:
         raise MeshError(f"{path.name}: {error}.") from None
 
 
-def _by_columns(path: Path, blocks: list[np.ndarray]) -> dict[int, np.ndarray]:
+def _sort_by_columns(path: Path, blocks: list[np.ndarray]) -> dict[int, np.ndarray]:
     for block in blocks:
         if block.ndim != 2 or block.shape[1] not in (3, 4) or block.dtype.kind not in "iu":
             raise MeshError(

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Int
 
 from ..errors import MeshError
-from ._contents import by_size, check_polygons
+from ._contents import check_polygons, sort_by_size
 
 _Blocks = dict[int, Int[np.ndarray, "_ _"]]
 
@@ -27,7 +27,7 @@ def polygons(path: Path, ends: Int[np.ndarray, "f"], corners: Int[np.ndarray, "c
     sizes = np.diff(ends, prepend=0)
     check_polygons(path, sizes)
     _check_corners(path, ends, corners)
-    return by_size(corners, ends - sizes, sizes)
+    return sort_by_size(corners, ends - sizes, sizes)
 
 
 def strips(path: Path, ends: Int[np.ndarray, "s"], corners: Int[np.ndarray, "c"]) -> Int[np.ndarray, "t 3"]:
@@ -87,10 +87,10 @@ def surface_cells(
     own[last], own[last - 1] = own[last - 1], own[last]
     faces = polygons(path, own_ends, own)
     strip_ends, _, strip_corners = of(_STRIP)
-    return with_triangles(faces, strips(path, strip_ends, strip_corners))
+    return append_triangles(faces, strips(path, strip_ends, strip_corners))
 
 
-def with_triangles(faces: _Blocks | None, more: Int[np.ndarray, "t 3"]) -> _Blocks | None:
+def append_triangles(faces: _Blocks | None, more: Int[np.ndarray, "t 3"]) -> _Blocks | None:
     """The faces, and more triangles after theirs; None where there are none at all."""
     if faces is None:
         return {3: more, 4: np.zeros((0, 4), more.dtype)} if len(more) else None

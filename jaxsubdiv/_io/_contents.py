@@ -1,10 +1,9 @@
 """What passes between the front doors and the formats: plain arrays, not yet checked as a mesh."""
 
-import importlib
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, Shaped
@@ -37,29 +36,18 @@ VertexData = Mapping[str, Shaped[np.ndarray, "v"]]
 """Name -> one number a vertex."""
 
 
-def library(module: str, what: str) -> Any:
-    """Import a library of the extra `io`, or say how to get it."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        root = module.partition(".")[0]
-        raise ImportError(
-            f"{what} need {root}, which cannot be imported ({error}). Install it with: pip install 'jaxsubdiv[io]'"
-        ) from error
-
-
 def warn(path: Path, text: str) -> None:
     """Warn about what a file does to the mesh; the text starts with the file's name."""
     notices.warn(f"{path.name}: {text}")
 
 
-def doubles(values: Shaped[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+def as_double(values: Shaped[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """A copy in float64; what is not finite there is so without a warning, to be named later by its row."""
     with np.errstate(invalid="ignore", over="ignore"):
         return values.astype(np.float64)
 
 
-def triangles_only(path: Path, format_: str, contents: Contents) -> Int[np.ndarray, "t 3"]:
+def split_quads(path: Path, format_: str, contents: Contents) -> Int[np.ndarray, "t 3"]:
     """The faces for a format that holds no quads: these are split in two, and a warning says so."""
     faces = contents.faces or {}
     triangles, quads = faces.get(3, np.zeros((0, 3), int)), faces.get(4, np.zeros((0, 4), int))
@@ -69,7 +57,7 @@ def triangles_only(path: Path, format_: str, contents: Contents) -> Int[np.ndarr
     return np.concatenate([triangles, quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
-def in_single_precision(path: Path, format_: str, vertices: Float[np.ndarray, "v 3"]) -> Float32[np.ndarray, "v 3"]:
+def round_to_single(path: Path, format_: str, vertices: Float[np.ndarray, "v 3"]) -> Float32[np.ndarray, "v 3"]:
     """The vertices for a format that knows no other precision; a warning says by how much they were rounded."""
     with np.errstate(over="ignore"):
         single = vertices.astype(np.float32)
@@ -92,7 +80,7 @@ def check_polygons(path: Path, sizes: Int[np.ndarray, "f"]) -> None:
         )
 
 
-def whole(path: Path, values: Shaped[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
+def as_indices(path: Path, values: Shaped[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
     """Vertex indices as int64; text formats give them as floating point."""
     with np.errstate(invalid="ignore"):  # NaN and infinity differ from any integer, and are caught below
         indices = values.astype(np.int64)
@@ -103,7 +91,7 @@ def whole(path: Path, values: Shaped[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]
     return indices
 
 
-def by_size(
+def sort_by_size(
     values: Shaped[np.ndarray, "n"], starts: Int[np.ndarray, "f"], sizes: Int[np.ndarray, "f"]
 ) -> dict[int, Shaped[np.ndarray, "_ _"]]:
     """Triangles and quads out of one run of numbers: face `i` is `values[starts[i] : starts[i] + sizes[i]]`."""

@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import MeshError
 from ..tables import decode
 from . import _table
-from ._contents import Contents, VertexData, doubles, in_single_precision, triangles_only, warn, whole
+from ._contents import Contents, VertexData, as_double, as_indices, round_to_single, split_quads, warn
 from ._text import Rows, parse_rows
 
 _MARK = "#!ascii"
@@ -54,13 +54,13 @@ def read_binary(path: Path) -> Contents:
             f"{path.name}, byte {begin}: {n_vertices} vertices and {n_faces} triangles are announced, which is not "
             f"what its {len(data)} bytes hold. The file is cut off or damaged."
         )
-    _tell_centre(path, data[end : end + _MOST_VOLUME_INFO])
+    _warn_of_centre(path, data[end : end + _MOST_VOLUME_INFO])
     vertices = np.frombuffer(data, ">f4", 3 * n_vertices, begin + 8).reshape(-1, 3)
     faces = np.frombuffer(data, ">i4", 3 * n_faces, corners).reshape(-1, 3).astype(np.int64)
-    return Contents(doubles(vertices), {3: faces} if n_faces else None)
+    return Contents(as_double(vertices), {3: faces} if n_faces else None)
 
 
-def _tell_centre(path: Path, volume_info: bytes) -> None:
+def _warn_of_centre(path: Path, volume_info: bytes) -> None:
     found = _CENTRE.search(volume_info)
     if not found or _INVALID.search(volume_info) or volume_info.startswith(_IN_SCANNER_SPACE):
         return
@@ -79,8 +79,8 @@ def _tell_centre(path: Path, volume_info: bytes) -> None:
 
 def write(path: Path, contents: Contents, data: VertexData) -> None:
     """Binary, triangles in single precision; without the image's place, so that the coordinates are all there is."""
-    vertices = in_single_precision(path, "FreeSurfer", contents.vertices)
-    triangles = triangles_only(path, "FreeSurfer", contents)
+    vertices = round_to_single(path, "FreeSurfer", contents.vertices)
+    triangles = split_quads(path, "FreeSurfer", contents)
     counts = np.array([len(vertices), len(triangles)], ">i4")
     parts = [_MAGIC, b"created by jaxsubdiv\n\n", counts, vertices.astype(">f4"), triangles.astype(">i4")]
     path.write_bytes(b"".join(part if isinstance(part, bytes) else part.tobytes() for part in parts))
@@ -92,7 +92,7 @@ def read_text(path: Path) -> Contents:
     faces = rows.part(1 + n_vertices, 1 + n_vertices + n_faces)
     _check(path, faces, n_faces, "faces")
     vertices = _vertices(path, rows, n_vertices)
-    return Contents(vertices.vertices, {3: whole(path, faces.table(3))} if n_faces else None)
+    return Contents(vertices.vertices, {3: as_indices(path, faces.table(3))} if n_faces else None)
 
 
 def read_points(path: Path) -> Contents:
@@ -115,7 +115,7 @@ def _rows(path: Path) -> tuple[Rows, int, int]:
     rows = parse_rows(path, re.sub(r"#[^\n]*", "", text))
     if len(rows.counts) == 0 or rows.counts[0] != 2:
         raise MeshError(f"{path.name}: after '{_MARK}' the numbers of vertices and faces must follow.")
-    n_vertices, n_faces = whole(path, rows.values[:2]).tolist()
+    n_vertices, n_faces = as_indices(path, rows.values[:2]).tolist()
     return rows, n_vertices, n_faces
 
 

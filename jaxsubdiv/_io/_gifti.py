@@ -13,16 +13,16 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from ..errors import MeshError
+from ..extras import import_extra
 from . import _xml
 from ._contents import (
     Contents,
     VertexData,
-    doubles,
-    in_single_precision,
-    library,
-    triangles_only,
+    as_double,
+    as_indices,
+    round_to_single,
+    split_quads,
     warn,
-    whole,
 )
 from ._text import parse_rows
 
@@ -44,7 +44,7 @@ def read(path: Path) -> Contents:
     """
     arrays = _arrays(path)
     triangles = [array for array in arrays if _intent(array) == "TRIANGLE"]
-    return _points(path, arrays)._replace(faces={3: whole(path, _rows(path, triangles[0]))} if triangles else None)
+    return _points(path, arrays)._replace(faces={3: as_indices(path, _rows(path, triangles[0]))} if triangles else None)
 
 
 def read_points(path: Path) -> Contents:
@@ -76,7 +76,7 @@ def _points(path: Path, arrays: list[Element]) -> Contents:
                 "`darrays[0].coordsys.xform` of nibabel's image where the other space is wanted.",
             )
             break
-    return Contents(doubles(_rows(path, points)), None, doubles(_rows(path, normals[0])) if normals else None)
+    return Contents(as_double(_rows(path, points)), None, as_double(_rows(path, normals[0])) if normals else None)
 
 
 def _intent(array: Element) -> str:
@@ -146,9 +146,9 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
 
     No normals: Connectome Workbench opens no surface with more arrays than two.
     """
-    gifti = library("nibabel.gifti", ".gii files")
-    vertices = in_single_precision(path, "GIfTI", contents.vertices)
-    triangles = triangles_only(path, "GIfTI", contents).astype(np.int32)
+    gifti = import_extra("nibabel.gifti", "io", ".gii files")
+    vertices = round_to_single(path, "GIfTI", contents.vertices)
+    triangles = split_quads(path, "GIfTI", contents).astype(np.int32)
     arrays = [
         gifti.GiftiDataArray(vertices, "NIFTI_INTENT_POINTSET", "NIFTI_TYPE_FLOAT32"),
         gifti.GiftiDataArray(triangles, "NIFTI_INTENT_TRIANGLE", "NIFTI_TYPE_INT32"),
@@ -158,7 +158,7 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
 
 def write_data(path: Path, contents: Contents, data: VertexData) -> None:
     """The vertex data alone, an array each, as the measurements that go with a `.surf.gii`."""
-    gifti = library("nibabel.gifti", ".gii files")
+    gifti = import_extra("nibabel.gifti", "io", ".gii files")
     if not data:
         raise MeshError(
             f"{path.name}: such files hold vertex data alone. Give some, or write the surface to .surf.gii."

@@ -15,7 +15,7 @@ from jaxtyping import Shaped
 
 from ..errors import MeshError
 from ._colours import colours_of, to_linear
-from ._contents import Contents, VertexData, doubles, in_single_precision, triangles_only, warn
+from ._contents import Contents, VertexData, as_double, round_to_single, split_quads, warn
 
 _TYPES = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _CODES = {np.dtype(type_): code for code, type_ in _TYPES.items()}
@@ -35,11 +35,11 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
 
     The first vertex data colour the vertices; all are there as numbers too, each as an attribute of its own.
     """
-    vertices = in_single_precision(path, "glTF", contents.vertices)
-    triangles = triangles_only(path, "glTF", contents)
+    vertices = round_to_single(path, "glTF", contents.vertices)
+    triangles = split_quads(path, "glTF", contents)
     columns: dict[str, Shaped[np.ndarray, "v *c"]] = {"POSITION": vertices}
     if contents.normals is not None:
-        columns["NORMAL"] = _of_length_one(contents.normals).astype("<f4")
+        columns["NORMAL"] = _normalise(contents.normals).astype("<f4")
     extras: dict[str, Any] = dict(_MM)
     for name, values in data.items():
         known, values = np.isfinite(values), values.astype(np.float64)
@@ -57,7 +57,7 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
     _write_chunks(path, columns, triangles.astype("<u4").ravel(), extras)
 
 
-def _of_length_one(normals: Shaped[np.ndarray, "v 3"]) -> Shaped[np.ndarray, "v 3"]:
+def _normalise(normals: Shaped[np.ndarray, "v 3"]) -> Shaped[np.ndarray, "v 3"]:
     """As the standard has them; those of no length point up."""
     scaled = normals / np.maximum(np.abs(normals).max(axis=1, keepdims=True), np.finfo(float).tiny)
     length = np.linalg.norm(scaled, axis=1, keepdims=True)
@@ -162,8 +162,8 @@ def _read_part(file: _File, part: dict[str, Any]) -> Contents:
     if part.get("mode", _TRIANGLES) != _TRIANGLES:
         raise ValueError(f"a part is drawn in the mode {str(part['mode'])[:20]}, where 4, triangles, is read")
     attributes = _dict(part.get("attributes"))
-    vertices = doubles(_numbers(file, attributes["POSITION"], "VEC3", "f"))
-    normals = doubles(_numbers(file, attributes["NORMAL"], "VEC3", "f")) if "NORMAL" in attributes else None
+    vertices = as_double(_numbers(file, attributes["POSITION"], "VEC3", "f"))
+    normals = as_double(_numbers(file, attributes["NORMAL"], "VEC3", "f")) if "NORMAL" in attributes else None
     if normals is not None and len(normals) != len(vertices):
         raise ValueError(f"it has {len(normals)} normals for {len(vertices)} vertices")
     corners = np.arange(len(vertices))
@@ -180,13 +180,13 @@ def _numbers(file: _File, place: Any, kind: str, letter: str) -> Shaped[np.ndarr
     """The numbers of an accessor."""
     accessor = _entry(file.gltf, "accessors", place)
     view = _entry(file.gltf, "bufferViews", accessor["bufferView"])
-    dtype = np.dtype(_TYPES.get(_whole(accessor, "componentType"), "V"))
+    dtype = np.dtype(_TYPES.get(_read_whole(accessor, "componentType"), "V"))
     if accessor.get("type") != kind or dtype.kind != letter or "sparse" in accessor or view.get("buffer") != 0:
         raise ValueError(f"the accessor {place} is of another kind than plain {kind} within the file")
     width = dtype.itemsize * _WIDTHS[kind]
-    count, stride = _whole(accessor, "count"), _whole(view, "byteStride", width)
-    begin, within = _whole(view, "byteOffset", 0), _whole(accessor, "byteOffset", 0)
-    end = begin + min(_whole(view, "byteLength"), len(file.binary))
+    count, stride = _read_whole(accessor, "count"), _read_whole(view, "byteStride", width)
+    begin, within = _read_whole(view, "byteOffset", 0), _read_whole(accessor, "byteOffset", 0)
+    end = begin + min(_read_whole(view, "byteLength"), len(file.binary))
     if stride < width or begin + within + stride * max(count - 1, 0) + width * (count > 0) > min(end, len(file.binary)):
         raise ValueError(f"the accessor {place} announces {count} times {kind}, which its bytes do not hold")
     shape = (count,) if kind == "SCALAR" else (count, _WIDTHS[kind])
@@ -208,7 +208,7 @@ def _entry(gltf: dict[str, Any], name: str, place: Any) -> dict[str, Any]:
     return _dict(entries[place])
 
 
-def _whole(entry: dict[str, Any], name: str, default: int | None = None) -> int:
+def _read_whole(entry: dict[str, Any], name: str, default: int | None = None) -> int:
     value = entry.get(name, default)
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**53:
         raise ValueError(f"`{name}` is {str(value)[:20]}, which is no whole number")

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..errors import MeshError
 from ..tables import decode
-from ._contents import Contents, by_size, check_polygons, whole
+from ._contents import Contents, as_indices, check_polygons, sort_by_size
 from ._text import parse_rows
 
 _BEGIN = re.compile(rb"\s*P\s+[-+.0-9]")
@@ -24,15 +24,19 @@ def read(path: Path, data: bytes) -> Contents:
     values, n = _values(path, data)
     contents = _vertices(path, values, n)
     at = 6 + 6 * n
-    n_faces, kind = whole(path, _part(path, values, at, 2, "the number of polygons and how they are coloured")).tolist()
+    n_faces, kind = as_indices(
+        path, _part(path, values, at, 2, "the number of polygons and how they are coloured")
+    ).tolist()
     if n_faces < 0 or kind not in (0, 1, 2):
         raise MeshError(f"{path.name}: {n_faces} polygons, coloured in the way {kind}, which must be 0, 1 or 2.")
     at += 2 + 4 * (1, n_faces, n)[kind]
-    ends = whole(path, _part(path, values, at, n_faces, "ends of the polygons"))
+    ends = as_indices(path, _part(path, values, at, n_faces, "ends of the polygons"))
     sizes = np.diff(ends, prepend=0)
     check_polygons(path, sizes)
-    corners = whole(path, _part(path, values, at + n_faces, int(ends[-1]) if n_faces else 0, "corners of the polygons"))
-    return contents._replace(faces=by_size(corners, ends - sizes, sizes) if n_faces else None)
+    corners = as_indices(
+        path, _part(path, values, at + n_faces, int(ends[-1]) if n_faces else 0, "corners of the polygons")
+    )
+    return contents._replace(faces=sort_by_size(corners, ends - sizes, sizes) if n_faces else None)
 
 
 def read_points(path: Path, data: bytes) -> Contents:

@@ -14,7 +14,7 @@ from .._regions import Regions, as_regions
 from ..errors import MeshError, name_rows
 from ..tables import decode
 from . import _mni
-from ._contents import Contents, VertexData, by_size, warn
+from ._contents import Contents, VertexData, sort_by_size, warn
 from ._frame import space_words
 from ._text import Rows, face_lines, number_lines, parse_rows, token_starts, tokens_per_line
 
@@ -60,7 +60,7 @@ def read(path: Path) -> Contents:
             "larger faces into triangles and quads, and drop smaller ones."
         )
     vertex, per_vertex = _indices(path, lines, f, corners, normals, len(vertices))
-    faces = by_size(vertex, np.cumsum(corners.sizes) - corners.sizes, corners.sizes)
+    faces = sort_by_size(vertex, np.cumsum(corners.sizes) - corners.sizes, corners.sizes)
     return Contents(vertices, faces, per_vertex, regions=_groups(lines, f, corners.sizes))
 
 
@@ -99,9 +99,9 @@ def _indices(
     """The vertex of every corner, and the normal of every vertex."""
     of_face = np.repeat(f, corners.sizes)  # the statement of every corner
     named = corners.normal != 0
-    vertex = _zero_based(path, corners.vertex, lines.of("v"), lines, of_face, "v")
-    normal = _zero_based(path, corners.normal[named], lines.of("vn"), lines, of_face[named], "vn")
-    return vertex, _per_vertex(path, vertex, named, normal, normals, n_vertices)
+    vertex = _resolve_indices(path, corners.vertex, lines.of("v"), lines, of_face, "v")
+    normal = _resolve_indices(path, corners.normal[named], lines.of("vn"), lines, of_face[named], "vn")
+    return vertex, _gather_per_vertex(path, vertex, named, normal, normals, n_vertices)
 
 
 def _groups(lines: _Lines, f: Int[np.ndarray, "f"], sizes: Int[np.ndarray, "f"]) -> Regions | None:
@@ -126,11 +126,11 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
         text += number_lines(contents.normals, "vn ")
         faces = "".join(f"f {' '.join(f'{i}//{i}' for i in face)}\n" for block in one_based for face in block.tolist())
     if contents.regions is not None:
-        faces = _in_groups(path, faces, contents.regions)
+        faces = _write_groups(path, faces, contents.regions)
     path.write_bytes((text + faces).encode())
 
 
-def _in_groups(path: Path, faces: str, regions: Regions) -> str:
+def _write_groups(path: Path, faces: str, regions: Regions) -> str:
     """The lines of the faces, with the name of their group before the first of each run."""
     for name in regions.names:
         if name != " ".join(name.split()) or "#" in name or name.endswith("\\"):
@@ -215,7 +215,7 @@ def _raise_bad_corner(path: Path, lines: _Lines, at: Int[np.ndarray, "f"]) -> No
     )
 
 
-def _zero_based(
+def _resolve_indices(
     path: Path,
     indices: Int[np.ndarray, "c"],
     at: Int[np.ndarray, "s"],
@@ -235,7 +235,7 @@ def _zero_based(
     return places
 
 
-def _per_vertex(
+def _gather_per_vertex(
     path: Path,
     vertex: Int[np.ndarray, "c"],
     named: Bool[np.ndarray, "c"],

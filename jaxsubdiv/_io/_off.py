@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import MeshError
 from ..tables import decode
-from ._contents import Contents, VertexData, by_size, check_polygons, whole
+from ._contents import Contents, VertexData, as_indices, check_polygons, sort_by_size
 from ._text import Rows, face_lines, number_lines, parse_rows
 
 _HEADER = re.compile(r"((ST)?(C)?(N)?(4)?(n)?OFF|off)\b")  # N: normals; n: vertices of n dimensions
@@ -20,10 +20,10 @@ def read(path: Path) -> Contents:
     """Vertices, their normals where the header says NOFF, and faces. Colours and texture coordinates are left out."""
     rows, n_vertices, n_faces, has_normals = _rows(path)
     if len(rows.counts) < 1 + n_vertices + n_faces or n_faces < 0:
-        raise _cut_off(path, rows, n_vertices, n_faces)
+        raise _cut_off_error(path, rows, n_vertices, n_faces)
     vertices = _vertices(path, rows, n_vertices, has_normals)
     faces = rows.part(1 + n_vertices, 1 + n_vertices + n_faces)
-    sizes = whole(path, faces.values[faces.starts])
+    sizes = as_indices(path, faces.values[faces.starts])
     short = np.flatnonzero(faces.counts - 1 < sizes)
     if len(short):
         raise MeshError(
@@ -31,15 +31,17 @@ def read(path: Path) -> Contents:
             "indices after that number."
         )
     check_polygons(path, sizes)
-    corners = by_size(faces.values, faces.starts + 1, sizes)
-    return vertices._replace(faces={size: whole(path, block) for size, block in corners.items()} if n_faces else None)
+    corners = sort_by_size(faces.values, faces.starts + 1, sizes)
+    return vertices._replace(
+        faces={size: as_indices(path, block) for size, block in corners.items()} if n_faces else None
+    )
 
 
 def read_points(path: Path) -> Contents:
     """Vertices, and their normals where the header says NOFF."""
     rows, n_vertices, n_faces, has_normals = _rows(path)
     if len(rows.counts) < 1 + n_vertices:
-        raise _cut_off(path, rows, n_vertices, n_faces)
+        raise _cut_off_error(path, rows, n_vertices, n_faces)
     return _vertices(path, rows, n_vertices, has_normals)
 
 
@@ -57,13 +59,13 @@ def _rows(path: Path) -> tuple[Rows, int, int, bool]:
     rows = parse_rows(path, text.replace(header[0], "", 1))
     if len(rows.counts) == 0 or rows.counts[0] < 2:
         raise MeshError(f"{path.name}: after OFF the numbers of vertices, faces and edges must follow.")
-    n_vertices, n_faces = whole(path, rows.values[:2]).tolist()
+    n_vertices, n_faces = as_indices(path, rows.values[:2]).tolist()
     if n_vertices < 0:
-        raise _cut_off(path, rows, n_vertices, n_faces)
+        raise _cut_off_error(path, rows, n_vertices, n_faces)
     return rows, n_vertices, n_faces, bool(header[4])
 
 
-def _cut_off(path: Path, rows: Rows, n_vertices: int, n_faces: int) -> MeshError:
+def _cut_off_error(path: Path, rows: Rows, n_vertices: int, n_faces: int) -> MeshError:
     return MeshError(
         f"{path.name}, line {rows.lines[0]}: {n_vertices} vertices and {n_faces} faces are announced, but "
         f"{len(rows.counts) - 1} rows follow. The file is cut off, or its header is wrong."

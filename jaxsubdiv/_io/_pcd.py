@@ -12,7 +12,7 @@ from jaxtyping import Shaped
 
 from ..errors import MeshError
 from ..tables import decode
-from ._contents import Contents, doubles, warn
+from ._contents import Contents, as_double, warn
 from ._text import parse_rows
 
 _POSITION, _NORMAL = ("x", "y", "z"), ("normal_x", "normal_y", "normal_z")
@@ -41,7 +41,7 @@ def read(path: Path) -> Contents:
     header = _read_header(path, data)
     columns = _read_text(path, data, header) if header.form == "ascii" else _read_binary(path, data, header)
     points, normals = (
-        np.stack([doubles(columns[name]) for name in names], axis=1) if set(names) <= columns.keys() else None
+        np.stack([as_double(columns[name]) for name in names], axis=1) if set(names) <= columns.keys() else None
         for names in (_POSITION, _NORMAL)
     )
     assert points is not None

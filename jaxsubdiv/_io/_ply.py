@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Int, Shaped
 
 from ..errors import MeshError
-from ._contents import Contents, VertexData, check_polygons, doubles, whole
+from ._contents import Contents, VertexData, as_double, as_indices, check_polygons
 from ._frame import space_words
 from ._text import Rows, parse_rows
 
@@ -96,7 +96,7 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
     columns = dict(zip(_POSITION, contents.vertices.T, strict=True))
     if contents.normals is not None:
         columns |= zip(_NORMAL, contents.normals.T, strict=True)
-    columns |= _stored(data)
+    columns |= _convert_data(data)
     table = np.zeros(len(contents.vertices), [(name, c.dtype.newbyteorder("<")) for name, c in columns.items()])
     for name, column in columns.items():
         table[name] = column
@@ -120,7 +120,7 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
             file.write(rows.tobytes())
 
 
-def _stored(data: VertexData) -> VertexData:
+def _convert_data(data: VertexData) -> VertexData:
     """Vertex data in the types and under the names that PLY knows."""
     stored = {}
     for name, column in data.items():
@@ -189,7 +189,7 @@ def _triple(columns: _Columns, names: tuple[str, str, str]) -> np.ndarray | None
     found = [columns.get(name) for name in names]
     if not all(isinstance(column, np.ndarray) for column in found):
         return None
-    return doubles(np.stack(found, axis=1))  # type: ignore[arg-type]
+    return as_double(np.stack(found, axis=1))  # type: ignore[arg-type]
 
 
 def _faces(path: Path, columns: _Columns) -> dict[int, Int[np.ndarray, "_ _"]] | None:
@@ -200,7 +200,7 @@ def _faces(path: Path, columns: _Columns) -> dict[int, Int[np.ndarray, "_ _"]] |
     for size, rows in corners.rows.items():
         sizes[rows] = size
     check_polygons(path, sizes)
-    return {size: whole(path, values) for size, values in corners.values.items()} or None
+    return {size: as_indices(path, values) for size, values in corners.values.items()} or None
 
 
 def _read_text(path: Path, data: bytes, header: _Header) -> dict[str, _Columns]:

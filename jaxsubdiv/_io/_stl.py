@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from ..errors import MeshError, name_rows
 from ..tables import decode
-from ._contents import Contents, VertexData, doubles, triangles_only, warn
+from ._contents import Contents, VertexData, as_double, split_quads, warn
 from ._frame import space_words
 from ._text import parse_rows
 
@@ -29,7 +29,7 @@ def read(path: Path) -> Contents:
     # Binary files may begin with "solid" too, so only their length tells: four letters of text announce more facets
     # than any such file has.
     if trailing == 0 or (trailing > 0 and n_facets > 0):
-        corners = doubles(np.frombuffer(data, _FACET, n_facets, _HEADER)["corners"]).reshape(-1, 3)
+        corners = as_double(np.frombuffer(data, _FACET, n_facets, _HEADER)["corners"]).reshape(-1, 3)
         if trailing:
             warn(path, f"{trailing} bytes after the last of {n_facets} triangles were left out.")
     elif data.lstrip()[:5].lower() == b"solid" and b"\0" not in data[:_HEADER]:
@@ -45,7 +45,7 @@ def read(path: Path) -> Contents:
 
 def write(path: Path, contents: Contents, data: VertexData) -> None:
     """Triangles, without rounding: binary where single precision holds every coordinate, otherwise text."""
-    corners = contents.vertices[triangles_only(path, "STL", contents)]
+    corners = contents.vertices[split_quads(path, "STL", contents)]
     with np.errstate(over="ignore", invalid="ignore"):
         single = corners.astype(np.float32)
     title = f"jaxsubdiv {space_words(contents.frame)}".strip()

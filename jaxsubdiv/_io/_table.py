@@ -34,10 +34,10 @@ def read(path: Path) -> Contents:
     the normals; a warning says what was left out.
     """
     table = read_table(path)
-    return _by_headings(path, table) if table.headings else _by_place(path, table)
+    return _read_by_headings(path, table) if table.headings else _read_by_place(path, table)
 
 
-def _by_headings(path: Path, table: Table) -> Contents:
+def _read_by_headings(path: Path, table: Table) -> Contents:
     names = [_known_name(name) for name in table.headings]
     known = [name for name in names if name in (*_POSITION, *_NORMAL, _WEIGHT)]
     n_normal = len(set(_NORMAL) & set(known))
@@ -67,7 +67,7 @@ def _known_name(heading: str) -> str:
     return heading
 
 
-def _by_place(path: Path, table: Table) -> Contents:
+def _read_by_place(path: Path, table: Table) -> Contents:
     if table.n_columns < 3:
         raise MeshError(
             f"{path.name}, line {table.line}: {table.n_columns} columns. A point needs at least x, y and z, and "

@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Int, Shaped
 
 from ..errors import MeshError, name_rows
-from ._cells import polygons, strips, surface_cells, with_triangles
-from ._contents import Contents, VertexData, doubles, library
+from ..extras import import_extra
+from ._cells import append_triangles, polygons, strips, surface_cells
+from ._contents import Contents, VertexData, as_double
 from ._frame import space_words
 from ._text import parse_numbers, token_starts
 
@@ -122,7 +123,7 @@ def read(path: Path) -> Contents:
         return contents._replace(faces=surface_cells(path, types, *cells["cells"]))
     none = np.zeros(0, int), np.zeros(0, int)
     more = strips(path, *cells.get("triangle_strips", none))
-    return contents._replace(faces=with_triangles(polygons(path, *cells.get("polygons", none)), more))
+    return contents._replace(faces=append_triangles(polygons(path, *cells.get("polygons", none)), more))
 
 
 def read_points(path: Path) -> Contents:
@@ -132,7 +133,7 @@ def read_points(path: Path) -> Contents:
 
 def write(path: Path, contents: Contents, data: VertexData) -> None:
     """Double precision, binary; `path` ends in .vtp or .vtk."""
-    pyvista = library("pyvista", ".vtp and .vtk files")
+    pyvista = import_extra("pyvista", "io", ".vtp and .vtk files")
     rows = [np.insert(corners, 0, size, axis=1).ravel() for size, corners in (contents.faces or {}).items()]
     polydata = pyvista.PolyData(contents.vertices, np.concatenate(rows))
     if contents.normals is not None:
@@ -143,14 +144,14 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
             raise MeshError(f"`vertex_data` has the name '{_NORMALS}', which the normals of the mesh take.")
         polydata.point_data[name] = column
     if path.suffix.lower() == ".vtp":
-        writer = library("vtkmodules.vtkIOXML", ".vtp files").vtkXMLPolyDataWriter()
+        writer = import_extra("vtkmodules.vtkIOXML", "io", ".vtp files").vtkXMLPolyDataWriter()
     else:
-        writer = library("vtkmodules.vtkIOLegacy", ".vtk files").vtkPolyDataWriter()
+        writer = import_extra("vtkmodules.vtkIOLegacy", "io", ".vtk files").vtkPolyDataWriter()
         writer.SetFileTypeToBinary()
         writer.SetHeader(f"jaxsubdiv {space_words(contents.frame)}".strip())
     writer.SetInputData(polydata)
     writer.SetFileName(str(path))
-    done, messages = _watch(writer.Write)
+    done, messages = watch(writer.Write)
     if not done or messages:
         raise OSError(f"{path.name}: VTK could not write the file: {messages or 'it gives no reason'}")
 
@@ -185,7 +186,7 @@ def _read(
             case name if name in _CELLS:
                 cells[name] = _read_cells(cursor, words)
             case "cell_types":
-                types = _whole(cursor, cursor.numbers(cursor.count(words, 1), "int"))
+                types = _check_whole(cursor, cursor.numbers(cursor.count(words, 1), "int"))
             case "cell_data" | "point_data":
                 n_tuples, of_points = cursor.count(words, 1), words[0] == "point_data"
             case "metadata":
@@ -199,18 +200,18 @@ def _read(
     if points is None:
         raise MeshError(f"{path.name}: it has no POINTS. It is cut off, or no file of a surface.")
     fitting = [rows for _, rows in sorted(normals.items()) if rows.shape == points.shape]
-    return Contents(doubles(points), None, doubles(fitting[0]) if fitting else None), cells, types
+    return Contents(as_double(points), None, as_double(fitting[0]) if fitting else None), cells, types
 
 
 def _read_cells(cursor: _Cursor, words: list[str]) -> tuple[Int[np.ndarray, "f"], Int[np.ndarray, "c"]]:
     n, size = cursor.count(words, 1), cursor.count(words, 2)
     if cursor.next_begins("offsets"):  # since version 5.1: one offset more than there are cells
-        offsets = _whole(cursor, cursor.numbers(n, cursor.words()[-1]))
+        offsets = _check_whole(cursor, cursor.numbers(n, cursor.words()[-1]))
         if not cursor.next_begins("connectivity"):
             cursor.refuse("CONNECTIVITY must follow OFFSETS")
-        corners = _whole(cursor, cursor.numbers(size, cursor.words()[-1]))
+        corners = _check_whole(cursor, cursor.numbers(size, cursor.words()[-1]))
         return offsets[1:], corners
-    values, ends, at = _whole(cursor, cursor.numbers(size, "int")), np.zeros(min(n, size), int), 0
+    values, ends, at = _check_whole(cursor, cursor.numbers(size, "int")), np.zeros(min(n, size), int), 0
     is_corner = np.ones(size, bool)
     for i in range(n):
         if at >= size or values[at] < 0:
@@ -227,12 +228,12 @@ def _read_attribute(cursor: _Cursor, words: list[str], n: int) -> dict[int, np.n
         case ["normals", *_]:
             return {0: cursor.numbers(3 * n, words[-1]).reshape(-1, 3)}
         case [kind, name, type_] if kind in _VECTORS:
-            return _named(name, cursor.numbers(_VECTORS[kind] * n, type_), _VECTORS[kind])
+            return _find_normals(name, cursor.numbers(_VECTORS[kind] * n, type_), _VECTORS[kind])
         case ["scalars", name, type_, *width]:
             n_columns = cursor.count(width, 0) if width else 1
             if cursor.next_begins("lookup_table"):
                 cursor.words()
-            return _named(name, cursor.numbers(n_columns * n, type_), n_columns)
+            return _find_normals(name, cursor.numbers(n_columns * n, type_), n_columns)
         case ["color_scalars", _, width]:
             cursor.numbers(cursor.count([width], 0) * n, "unsigned_char")
         case ["lookup_table", _, size]:
@@ -261,15 +262,15 @@ def _read_field(cursor: _Cursor, n_arrays: int) -> dict[int, np.ndarray] | None:
         elif words[-1] not in _TYPES:
             return None
         else:
-            found |= _named(words[0], cursor.numbers(n_columns * n, words[-1]), n_columns)
+            found |= _find_normals(words[0], cursor.numbers(n_columns * n, words[-1]), n_columns)
     return found
 
 
-def _named(name: str, values: np.ndarray, n_columns: int) -> dict[int, np.ndarray]:
+def _find_normals(name: str, values: np.ndarray, n_columns: int) -> dict[int, np.ndarray]:
     return {1: values.reshape(-1, 3)} if name == _NORMALS.lower() and n_columns == 3 else {}
 
 
-def _whole(cursor: _Cursor, values: Shaped[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+def _check_whole(cursor: _Cursor, values: Shaped[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
     with np.errstate(invalid="ignore"):
         indices = values.astype(np.int64)
     if (wrong := np.flatnonzero(indices != values)).size:
@@ -277,9 +278,9 @@ def _whole(cursor: _Cursor, values: Shaped[np.ndarray, "n"]) -> Int[np.ndarray, 
     return indices
 
 
-def _watch(act: Any) -> tuple[Any, str]:
+def watch(act: Any) -> tuple[Any, str]:
     """What `act` returns and what VTK says meanwhile, which would otherwise go to the terminal."""
-    core = library("vtkmodules.vtkCommonCore", ".vtp and .vtk files")
+    core = import_extra("vtkmodules.vtkCommonCore", "io", ".vtp and .vtk files")
     window, window_before = core.vtkStringOutputWindow(), core.vtkOutputWindow.GetInstance()
     logged_before = core.vtkLogger.GetCurrentVerbosityCutoff()
     core.vtkOutputWindow.SetInstance(window)

@@ -14,8 +14,8 @@ from jaxtyping import Int, Shaped
 
 from ..errors import MeshError
 from . import _xml
-from ._cells import polygons, strips, surface_cells, with_triangles
-from ._contents import Contents, doubles, whole
+from ._cells import append_triangles, polygons, strips, surface_cells
+from ._contents import Contents, as_double, as_indices
 from ._text import parse_rows
 
 _TYPES = {
@@ -95,18 +95,22 @@ def _points(file: _File, piece: Element) -> Contents:
     points = _array(file, array, 3 * n).reshape(-1, 3)
     data = piece.find("PointData")
     if data is None:
-        return Contents(doubles(points))
+        return Contents(as_double(points))
     arrays = [array for array in data.findall("DataArray") if array.get("NumberOfComponents") == "3"]
     marked = [array for array in arrays if array.get("Name") == data.get("Normals")]
     marked += [array for array in arrays if (array.get("Name") or "").lower() == "normals"]
-    return Contents(doubles(points), None, doubles(_array(file, marked[0], 3 * n).reshape(-1, 3)) if marked else None)
+    return Contents(
+        as_double(points),
+        None,
+        as_double(_array(file, marked[0], 3 * n).reshape(-1, 3)) if marked else None,
+    )
 
 
 def _faces(file: _File, piece: Element) -> dict[int, Int[np.ndarray, "_ _"]] | None:
     """Polygons and the triangles of strips, of a piece of polygons."""
     faces = polygons(file.path, *_cells(file, piece, "Polys", _count(file, piece, "NumberOfPolys")))
     more = strips(file.path, *_cells(file, piece, "Strips", _count(file, piece, "NumberOfStrips")))
-    return with_triangles(faces, more)
+    return append_triangles(faces, more)
 
 
 def _grid_faces(file: _File, piece: Element) -> dict[int, Int[np.ndarray, "_ _"]] | None:
@@ -117,7 +121,7 @@ def _grid_faces(file: _File, piece: Element) -> dict[int, Int[np.ndarray, "_ _"]
     types = next((array for array in piece.findall("Cells/DataArray") if array.get("Name") == "types"), None)
     if types is None:
         raise MeshError(f"{file.path.name}: the element 'Cells' needs the array 'types'.")
-    return surface_cells(file.path, whole(file.path, _array(file, types, n)), *_cells(file, piece, "Cells", n))
+    return surface_cells(file.path, as_indices(file.path, _array(file, types, n)), *_cells(file, piece, "Cells", n))
 
 
 def _cells(file: _File, piece: Element, name: str, n: int) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "c"]]:
@@ -127,8 +131,8 @@ def _cells(file: _File, piece: Element, name: str, n: int) -> tuple[Int[np.ndarr
         return np.zeros(0, int), np.zeros(0, int)
     if not {"offsets", "connectivity"} <= arrays.keys():
         raise MeshError(f"{file.path.name}: the element '{name}' needs the arrays 'connectivity' and 'offsets'.")
-    ends = whole(file.path, _array(file, arrays["offsets"], n))
-    return ends, whole(file.path, _array(file, arrays["connectivity"], max(int(ends[-1]), 0)))
+    ends = as_indices(file.path, _array(file, arrays["offsets"], n))
+    return ends, as_indices(file.path, _array(file, arrays["connectivity"], max(int(ends[-1]), 0)))
 
 
 def _join(parts: list[Contents]) -> Contents:

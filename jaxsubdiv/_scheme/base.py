@@ -15,8 +15,20 @@ from .._masks import Matrix, as_masks, identity, stack
 from .._normals import Boundary, Weights, chord_normals, fan_normals, ring_sum
 from .._stage import Sides, Stage, hybrid_split, sides_of
 from .._topology import AbstractLevel, Level, LimitMasks, MaskLevel, point_normal_level
-from ..linalg import Rows, Vectors, apart, kept_apart, largest, take_each, take_planes, together, unit, unit_or, where
-from .seams import on_seams
+from ..linalg import (
+    Rows,
+    Vectors,
+    compile_apart,
+    join_rows,
+    max_abs,
+    split_rows,
+    take_each,
+    take_planes,
+    unit,
+    unit_or,
+    where,
+)
+from .seams import place_seam_points
 
 OldNormals: TypeAlias = Literal["keep", "recompute"]
 
@@ -37,7 +49,7 @@ class Edges(NamedTuple):
 
 def gather_edges(level: Level, values: Float[Array, "v 6"]) -> Edges:
     """Ends of the edges of `level`, from the positions and normals side by side: one look-up an end."""
-    (x_a, n_a), (x_b, n_b) = (map(apart, lax.split(end, (3, 3), axis=2)) for end in take_each(values, level.edges))
+    (x_a, n_a), (x_b, n_b) = (map(split_rows, lax.split(end, (3, 3), axis=2)) for end in take_each(values, level.edges))
     return Edges(x_a, x_b, n_a, n_b)
 
 
@@ -163,7 +175,7 @@ class AbstractPointNormalScheme(AbstractScheme):
         values = jnp.concatenate([x, n], axis=1)
         edge_points = _edge_points(self, h, level, values)
         if level.seams is not None:
-            edge_points = on_seams(level, x, n, edge_points, h, self.seam_factor)
+            edge_points = place_seam_points(level, x, n, edge_points, h, self.seam_factor)
         face_points = _face_points(self, h, level, x, n, edge_points)
         refined = jnp.concatenate([x, edge_points, face_points])
         edge_normals = _unit_normals(_edge_normal_sums(self, level, values, refined), n, level.edges)
@@ -177,14 +189,14 @@ class AbstractPointNormalScheme(AbstractScheme):
 # The stages of a level. Each runs over the edges or the quads once.
 
 
-@kept_apart
+@compile_apart
 def _edge_points(
     scheme: AbstractPointNormalScheme, h: Float[Array, ""], level: Level, values: Float[Array, "v 6"]
 ) -> Float[Array, "e 3"]:
-    return together(scheme.edge_points(h, gather_edges(level, values)))[0]
+    return join_rows(scheme.edge_points(h, gather_edges(level, values)))[0]
 
 
-@kept_apart
+@compile_apart
 def _face_points(
     scheme: AbstractPointNormalScheme,
     h: Float[Array, ""],
@@ -193,27 +205,27 @@ def _face_points(
     n: Float[Array, "v 3"],
     edge_points: Float[Array, "e 3"],
 ) -> Float[Array, "q 3"]:
-    return together(scheme.face_points(h, level, x, n, edge_points))[0]
+    return join_rows(scheme.face_points(h, level, x, n, edge_points))[0]
 
 
-@kept_apart
+@compile_apart
 def edge_chord_normals(level: Level, values: Float[Array, "v 6"]) -> Float[Array, "e 3"]:
     """The normal of every edge, at right angles to it."""
     (x_a, x_b), (n_a, n_b) = (take_planes(rows, level.edges) for rows in lax.split(values, (3, 3), axis=1))
-    return together(chord_normals(n_a, n_b, x_b - x_a))[0]
+    return join_rows(chord_normals(n_a, n_b, x_b - x_a))[0]
 
 
-@kept_apart
+@compile_apart
 def _edge_normal_sums(
     scheme: AbstractPointNormalScheme, level: Level, values: Float[Array, "v 6"], refined: Float[Array, "w 3"]
 ) -> Float[Array, "4 e"]:
     """Eq. (6) around every edge vertex of the refined mesh, and how much of it is rounding."""
     n_old, n_edges = values.shape[0], level.edges.shape[0]
     look_up = take_each if scheme.weights == "area" else take_planes
-    (x_a, x_b), wings = (list(map(apart, look_up(refined, table))) for table in (level.edges, level.wings))
+    (x_a, x_b), wings = (list(map(split_rows, look_up(refined, table))) for table in (level.edges, level.wings))
     half = len(wings) // 2
     ring = [x_b, *wings[:half], x_a, *wings[half:]]
-    centre = apart(refined[None, n_old : n_old + n_edges])
+    centre = split_rows(refined[None, n_old : n_old + n_edges])
     total, rounding = ring_sum(centre, ring, scheme.weights, ring_corners(level, n_old))
     if scheme.boundary == "chord":
         on_boundary = is_boundary(level, n_old)
@@ -222,13 +234,13 @@ def _edge_normal_sums(
             return jnp.broadcast_to(0 * lax.stop_gradient(values[:1, :3]), (n_edges, 3))  # as in `_unit_normals`
 
         of_edges = jax.checkpoint(partial(edge_chord_normals, level))
-        chord = apart(lax.cond(jnp.any(on_boundary), of_edges, of_nobody, values)[None])
-        takes_chord = on_boundary & (largest(chord) > 0)
+        chord = split_rows(lax.cond(jnp.any(on_boundary), of_edges, of_nobody, values)[None])
+        takes_chord = on_boundary & (max_abs(chord) > 0)
         total, rounding = where(takes_chord, chord, total), where(takes_chord, 0.0, rounding)
     return jnp.concatenate([*jax.tree.leaves(total), rounding])[..., 0]
 
 
-@kept_apart
+@compile_apart
 def _face_normal_sums(
     scheme: AbstractPointNormalScheme,
     level: Level,
@@ -237,17 +249,17 @@ def _face_normal_sums(
 ) -> Float[Array, "4 q"]:
     """The same around the face vertices."""
     look_up = take_each if scheme.weights == "area" else take_planes
-    spokes = list(map(apart, look_up(edge_points, level.quad_edges)))
-    total, rounding = ring_sum(apart(face_points[None]), spokes, scheme.weights)
+    spokes = list(map(split_rows, look_up(edge_points, level.quad_edges)))
+    total, rounding = ring_sum(split_rows(face_points[None]), spokes, scheme.weights)
     return jnp.concatenate([*jax.tree.leaves(total), rounding])[..., 0]
 
 
-@kept_apart
+@compile_apart
 def _unit_normals(sums: Float[Array, "4 m"], n: Float[Array, "v 3"], parents: Int[Array, "m k"]) -> Float[Array, "m 3"]:
     """Unit normals, eq. (6); where the sum vanishes: the unit sum of the parents' normals."""
     *total, rounding = lax.split(sums[..., None], (1, 1, 1, 1), axis=0)
     total = Vectors(*total)
-    there = largest(total) > jnp.maximum(rounding, jnp.finfo(sums.dtype).tiny)
+    there = max_abs(total) > jnp.maximum(rounding, jnp.finfo(sums.dtype).tiny)
 
     def of_parents(n: Float[Array, "v 3"]) -> Float[Array, "m 3"]:
         first, *others = take_each(n, parents)
@@ -259,7 +271,7 @@ def _unit_normals(sums: Float[Array, "4 m"], n: Float[Array, "v 3"], parents: In
 
     # The parents are looked up only where some sum vanishes: in most meshes none does.
     instead = lax.cond(jnp.all(there), of_nobody, jax.checkpoint(of_parents), n)
-    return together(unit_or(total, apart(instead[None]), rounding))[0]
+    return join_rows(unit_or(total, split_rows(instead[None]), rounding))[0]
 
 
 class AbstractLinearScheme(AbstractScheme):

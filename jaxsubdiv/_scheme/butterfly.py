@@ -6,7 +6,7 @@ from typing import ClassVar
 import equinox as eqx
 import numpy as np
 
-from .._masks import Matrix, Term, entries, scaled
+from .._masks import Matrix, Term, entries, scale_rows
 from .._normals import Weights
 from .._stage import Sides, Stage, ring_positions
 from .base import AbstractPrimalScheme
@@ -43,9 +43,9 @@ class ModifiedButterfly(AbstractPrimalScheme):
         regular = (n_special == 0) & ~on_boundary
         ring = _ring_rule(stage, sides, extraordinary, valence)
         return (
-            scaled(1.0 * regular, _eight_point_rule(stage, sides))
-            + scaled(np.where(on_boundary, 0.0, 1 / np.maximum(n_special, 1)), ring)
-            + scaled(1.0 * on_boundary, four_point_boundary(stage, sides))
+            scale_rows(1.0 * regular, _eight_point_rule(stage, sides))
+            + scale_rows(np.where(on_boundary, 0.0, 1 / np.maximum(n_special, 1)), ring)
+            + scale_rows(1.0 * on_boundary, four_point_boundary(stage, sides))
         )
 
 

@@ -6,9 +6,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._masks import Matrix, entries, scaled
+from .._masks import Matrix, entries, scale_rows
 from .._stage import Sides, Stage, quad_split
-from .creased import AbstractCreasedScheme, Edge, across_border, border
+from .creased import AbstractCreasedScheme, Edge, border, border_tangent_weights
 
 
 class CatmullClark(AbstractCreasedScheme):
@@ -49,7 +49,7 @@ class CatmullClark(AbstractCreasedScheme):
         v = np.arange(n)
         around = entries((n, centres.shape[0]), (sides.start, sides.face, 1.0)) @ centres
         neighbours = entries((n, n), (sides.start, sides.end, 1.0))
-        return entries((n, n), (v, v, 1 - 2 / k)) + scaled(1 / k**2, neighbours + around)
+        return entries((n, n), (v, v, 1 - 2 / k)) + scale_rows(1 / k**2, neighbours + around)
 
     def smooth_limit(self, stage: Stage, sides: Sides) -> Matrix:
         # Of the level after this one, where all faces are quads: (k v + 4 sum e + sum f) / (k (k + 5)). With the edge
@@ -60,7 +60,7 @@ class CatmullClark(AbstractCreasedScheme):
         )
         to_faces = entries((n, centres.shape[0]), (sides.start, sides.face, 1.0))
         to_edges = entries((n, edges.shape[0]), (sides.start, sides.edge, 4.0))
-        return scaled(1 / (k * (k + 5)), scaled(k**2, vertices) + to_edges @ edges + to_faces @ centres)
+        return scale_rows(1 / (k * (k + 5)), scale_rows(k**2, vertices) + to_edges @ edges + to_faces @ centres)
 
     def limit_tangents(self, stage: Stage, sides: Sides, position: Int[np.ndarray, "s"]) -> tuple[Matrix, Matrix]:
         # Of the quads that the next level has, for the reason given above. A vertex at the end of a single sharp edge
@@ -78,7 +78,7 @@ class CatmullClark(AbstractCreasedScheme):
         eigenvalue = 5 / 16 + (c + np.cos(theta / 2) * np.sqrt(2 * (9 + c))) / 16
         eigenvalue = np.where(k == 1, 1 / 2, eigenvalue)  # of no meaning there: a single face has no inner edges
         face = np.where(k == 1, 0.0, 1 / (16 * eigenvalue - 4))
-        itself, neighbour = across_border(
+        itself, neighbour = border_tangent_weights(
             k, eigenvalue, (1 / 16 + face / 4) * np.sin(theta), (3 / 8 + face / 2) * total
         )
         here, ahead = position * theta[sides.start], (position + 1) * theta[sides.start]

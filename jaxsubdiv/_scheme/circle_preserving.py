@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from .._normals import Boundary, Weights, chord_normals
 from .._topology import Level
-from ..linalg import Rows, Vectors, dot, kept_apart, take_planes, unit, where
+from ..linalg import Rows, Vectors, compile_apart, dot, take_planes, unit, where
 from .base import AbstractPointNormalScheme, Edges, edge_chord_normals, tangent_length
 from .interpolating import edge_rule
 
@@ -82,7 +82,7 @@ def _middle(h: Float[Array, ""], x_a: Vectors, x_b: Vectors, n_a: Vectors, n_b: 
     return Vectors(*middle[:3]), Vectors(*middle[3:])
 
 
-@kept_apart
+@compile_apart
 def _stacked_middle(
     h: Float[Array, ""], x_a: Vectors, x_b: Vectors, n_a: Vectors, n_b: Vectors
 ) -> Float[Array, "6 q 1"]:

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._fans import as_table
-from .._masks import Matrix, Term, as_masks, entries, identity, scaled
+from .._masks import Matrix, Term, as_masks, entries, identity, scale_rows
 from .._normals import Weights
 from .._patches import patch_vertices
-from .._stage import INFINITE, Sides, Stage, after_one_level, ring_positions, sides_of
+from .._stage import INFINITE, Sides, Stage, ring_positions, sides_of, wear
 from .._topology import LimitMasks
 from .base import AbstractPrimalScheme, check_option
 
@@ -25,9 +25,9 @@ class Sharpness(NamedTuple):
     edge: Float[np.ndarray, "e"]
     vertex: Float[np.ndarray, "v"]
 
-    def after_one_level(self) -> "Sharpness":
+    def wear(self) -> "Sharpness":
         """What is left of it at the next level."""
-        return Sharpness(after_one_level(self.edge), after_one_level(self.vertex))
+        return Sharpness(wear(self.edge), wear(self.vertex))
 
     def rule(self, stage: Stage) -> Int[np.ndarray, "v"]:
         """For every vertex 0 (smooth, or the end of one sharp edge), 1 (a crease) or 2 (a corner)."""
@@ -53,9 +53,9 @@ def crease_masks(stage: Stage, sharp: Bool[np.ndarray, "e"], centre: float, end:
     return entries((len(v), len(v)), (v, v, centre), (a, b, end), (b, a, end))
 
 
-def blended_vertices(stage: Stage, now: Sharpness, smooth: Matrix) -> Matrix:
+def blend_vertices(stage: Stage, now: Sharpness, smooth: Matrix) -> Matrix:
     """The smooth, the crease and the corner rule, where each holds; between two levels of sharpness a blend."""
-    later = now.after_one_level()
+    later = now.wear()
     rule, next_rule = now.rule(stage), later.rule(stage)
     ending = (now.edge > 0) & (later.edge == 0)
     ends = stage.edges[ending].ravel()
@@ -75,7 +75,7 @@ def blended_vertices(stage: Stage, now: Sharpness, smooth: Matrix) -> Matrix:
         for start, end in ((a, b), (b, a)):
             terms.append((start[sharp], end[sharp], np.where(along[start[sharp], i], 0.125, 0.0)))
     crease = entries((n, n), *terms)
-    return scaled(weight[0], smooth) + scaled(weight[1], crease) + scaled(weight[2], identity(n))
+    return scale_rows(weight[0], smooth) + scale_rows(weight[1], crease) + scale_rows(weight[2], identity(n))
 
 
 class AbstractCreasedScheme(AbstractPrimalScheme):
@@ -108,13 +108,13 @@ class AbstractCreasedScheme(AbstractPrimalScheme):
         """Weights of two tangents at every vertex, whose cross product points outward."""
 
     def vertex_masks(self, stage: Stage, sides: Sides) -> Matrix:
-        return blended_vertices(stage, sharpness(stage, sides, self.boundary), self.smooth_vertices(stage, sides))
+        return blend_vertices(stage, sharpness(stage, sides, self.boundary), self.smooth_vertices(stage, sides))
 
     def edge_masks(self, stage: Stage, sides: Sides) -> Matrix:
         sharp = np.minimum(sharpness(stage, sides, self.boundary).edge, 1.0)
         e, (a, b) = np.arange(len(stage.edges)), stage.edges.T
         middle = entries((len(e), stage.n_vertices), (e, a, 0.5), (e, b, 0.5))
-        return scaled(1 - sharp, self.smooth_edges(stage, sides)) + scaled(sharp, middle)
+        return scale_rows(1 - sharp, self.smooth_edges(stage, sides)) + scale_rows(sharp, middle)
 
     def limit(self, stage: Stage) -> LimitMasks:
         sides = sides_of(stage)
@@ -127,9 +127,9 @@ class AbstractCreasedScheme(AbstractPrimalScheme):
         rule, n = now.rule(stage), stage.n_vertices
         crease = crease_masks(stage, now.edge > 0, 2 / 3, 1 / 6)
         points = (
-            scaled(1.0 * (rule == 0), self.smooth_limit(stage, sides))
-            + scaled(1.0 * (rule == 1), crease)
-            + scaled(1.0 * (rule == 2), identity(n))
+            scale_rows(1.0 * (rule == 0), self.smooth_limit(stage, sides))
+            + scale_rows(1.0 * (rule == 1), crease)
+            + scale_rows(1.0 * (rule == 2), identity(n))
         )
         # On a crease inside there are two normals; the mesh's own, between them, stands in.
         n_ends = np.bincount(sides.start[sides.twin < 0], minlength=n)
@@ -138,7 +138,7 @@ class AbstractCreasedScheme(AbstractPrimalScheme):
         first, second = self.limit_tangents(stage, sides, ring_positions(sides))
         return LimitMasks(
             as_masks(points),
-            (as_masks(scaled(known, first)), as_masks(scaled(known, second))),
+            (as_masks(scale_rows(known, first)), as_masks(scale_rows(known, second))),
             as_table(patch_vertices(stage, sides, self.takes[-1], now.edge > 0)),
         )
 
@@ -161,7 +161,7 @@ def border(stage: Stage, sides: Sides) -> Border:
     return Border(*ends)
 
 
-def across_border(
+def border_tangent_weights(
     k: Float[np.ndarray, "v"],
     eigenvalue: Float[np.ndarray, "v"],
     beside: Float[np.ndarray, "v"],

@@ -5,7 +5,7 @@ from typing import ClassVar
 import equinox as eqx
 import numpy as np
 
-from .._masks import Matrix, Term, entries, scaled
+from .._masks import Matrix, Term, entries, scale_rows
 from .._normals import Weights
 from .._stage import Sides, Stage, ring_positions
 from .base import AbstractPrimalScheme
@@ -36,14 +36,14 @@ class Kobbelt(AbstractPrimalScheme):
     def edge_masks(self, stage: Stage, sides: Sides) -> Matrix:
         e, (a, b) = np.arange(len(stage.edges)), stage.edges.T
         rows = (len(e), stage.n_vertices)
-        beyond = _beyond(stage, sides)
+        beyond = _extend_sides(stage, sides)
         # The side that leaves each end along the edge; one that comes in over a boundary has no such side.
         n_sides = len(sides.start)
         at_b = np.where(stage.right >= 0, stage.right, 0)
         pick = [entries((len(e), n_sides), (e, stage.left, 1.0)), entries((len(e), n_sides), (e, at_b, 1.0))]
         inner = entries(rows, (e, a, 1 / 2 + _W), (e, b, 1 / 2 + _W)) - _W * (pick[0] @ beyond + pick[1] @ beyond)
         on_boundary = 1.0 * (stage.right < 0)
-        return scaled(1 - on_boundary, inner) + scaled(on_boundary, four_point_boundary(stage, sides))
+        return scale_rows(1 - on_boundary, inner) + scale_rows(on_boundary, four_point_boundary(stage, sides))
 
     def face_masks(self, stage: Stage, sides: Sides) -> Matrix:
         edges = self.edge_masks(stage, sides)
@@ -62,7 +62,7 @@ class Kobbelt(AbstractPrimalScheme):
         return entries((len(stage.faces[4]), edges.shape[0]), *terms) @ edges
 
 
-def _beyond(stage: Stage, sides: Sides) -> Matrix:
+def _extend_sides(stage: Stage, sides: Sides) -> Matrix:
     """For every side the point on the other side of its start, in line with it.
 
     With neighbours l_j and far corners h_j of the faces around a vertex of valence k, and the side toward l_0:

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from .._masks import Matrix, entries
 from .._stage import Sides, Stage
 from .base import check_option
-from .creased import AbstractCreasedScheme, Edge, across_border, border
+from .creased import AbstractCreasedScheme, Edge, border, border_tangent_weights
 
 Variant: TypeAlias = Literal["loop", "warren"]
 
@@ -75,7 +75,7 @@ class Loop(AbstractCreasedScheme):
         angle = np.where(on_border, np.pi, 2 * np.pi) * position / k[sides.start]
         theta = np.pi / k
         total = 1 / np.tan(theta / 2)  # of sin(i theta), i = 1 to k - 1
-        itself, neighbour = across_border(k, 3 / 8 + np.cos(theta) / 4, np.sin(theta) / 8, 3 / 8 * total)
+        itself, neighbour = border_tangent_weights(k, 3 / 8 + np.cos(theta) / 4, np.sin(theta) / 8, 3 / 8 * total)
         along = entries(
             (n, n),
             (sides.start, sides.end, np.where(on_border, 0.0, np.cos(angle))),

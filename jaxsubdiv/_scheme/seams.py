@@ -6,14 +6,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._topology import Level
-from ..linalg import Rows, dot, largest, take
+from ..linalg import Rows, dot, max_abs, take
 
 # Two normals that are closer than this (in length, about a degree) fade into one: so close, the direction at right
 # angles to both is lost, and its derivatives are large. At any sharper crease nothing of the fading is left.
 _FADE = 0.02
 
 
-def along_normals(d: Rows, left: Rows, right: Rows) -> Rows:
+def project_on_normals(d: Rows, left: Rows, right: Rows) -> Rows:
     """The part of `d` that lies in the plane of two unit normals; along the one normal where they agree.
 
     Their sum s and difference t are at right angles, so that it is (s.d) s/|s|^2 + (t.d) t/|t|^2: symmetric in the two
@@ -32,7 +32,7 @@ def _inverse(square: Float[Array, "*rows 1"]) -> Float[Array, "*rows 1"]:
     return jnp.where(faded, r * (3 - 2 * r) / _FADE**2, 1 / jnp.where(faded, 1.0, square))
 
 
-def on_seams(
+def place_seam_points(
     level: Level,
     x: Float[Array, "v 3"],
     n: Float[Array, "v 3"],
@@ -57,14 +57,14 @@ def on_seams(
     one, other = level.edges[level.seams[:, 0]], level.edges[level.seams[:, 1]]
     a, b = take(x, one[:, 0]), take(x, one[:, 1])
     d = b - a
-    n_a = along_normals(d, take(n, one[:, 0]), take(n, other[:, 1]))  # the sides run opposite ways
-    n_b = along_normals(d, take(n, one[:, 1]), take(n, other[:, 0]))
-    t_a, t_b = (_without_rounding(d - part, d) for part in (n_a, n_b))
+    n_a = project_on_normals(d, take(n, one[:, 0]), take(n, other[:, 1]))  # the sides run opposite ways
+    n_b = project_on_normals(d, take(n, one[:, 1]), take(n, other[:, 0]))
+    t_a, t_b = (_drop_rounding(d - part, d) for part in (n_a, n_b))
     points = 0.5 * (a + b) + (h / 8) * factor(t_a, t_b) * (n_b - n_a)
     # Computed once and put in twice: computed twice, compiled code may round the two sides apart.
     return edge_points.at[level.seams.reshape(-1)].set(jnp.repeat(points, 2, axis=0), mode="promise_in_bounds")
 
 
-def _without_rounding(t: Rows, d: Rows) -> Rows:
+def _drop_rounding(t: Rows, d: Rows) -> Rows:
     """Zero where nothing but rounding is left of `d`: that has no direction."""
-    return jnp.where(largest(t) > 16 * jnp.finfo(d.dtype).eps * largest(d), t, 0.0)
+    return jnp.where(max_abs(t) > 16 * jnp.finfo(d.dtype).eps * max_abs(d), t, 0.0)

@@ -175,7 +175,7 @@ def half(data: Path, subjects: Sequence[int], folder: Path) -> None:
         } | {"whole skull's": Plane(middle, normal)}
         ways = {"template": (placed, seen, own), "family": (member, seen, family)}
         for name, plane in planes.items():
-            both = np.concatenate([seen, plane.mirrored(seen)])
+            both = np.concatenate([seen, plane.mirror(seen)])
             ways[f"mirrored, {name} plane"] = member if name == "member's" else placed, both, own
         ways["whole skull (bound)"] = placed, whole, own
         for name, (start, points, priors) in ways.items():

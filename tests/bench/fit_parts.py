@@ -34,7 +34,7 @@ PARTS = {
     "solution": ["fitting.solve.sparse_normal.ArrowheadFactor.solve"],
     "strengths by the evidence": ["fitting.solve.sweeps.FromScan.update"],
     "degrees of freedom": ["fitting.solve.sweeps.count_determined"],
-    "faces upside down": ["fitting.solve.sweeps.Sweeps._turned_over"],
+    "faces upside down": ["fitting.solve.sweeps.Sweeps._find_turned_over"],
     "new surface": [f"fitting.solve.sweeps.{name}" for name in ("_retract", "Model.refine", "measure_movement")],
     "analysis, once a fit": [
         "fitting.run.fit.analyse",

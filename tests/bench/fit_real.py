@@ -152,7 +152,7 @@ def draw_montage(names: Sequence[str], pictures: Path) -> None:
         view = js.view_of(result.surface, CASES[name].towards)
         js.draw_surface(above, result.control_mesh, view=view, edges=True)
         above.set_title(f"{name}\n{result.scan.n_points:,} points, {len(result.control.vertices):,} vertices", size=10)
-        values = result.at_level().distances
+        values = result.refine_to().distances
         limit = float(np.percentile(np.abs(result.distances), 95))
         colours = js.draw_surface(
             below, result.surface, view=view, values=values, limits=(-limit, limit), cmap="RdBu_r"

@@ -99,7 +99,7 @@ def _tibia(name: str) -> Callable[[Path], Situation]:
 
 def _femur(n: int = 5000, sigma: float = 0.2) -> tuple[Float[np.ndarray, "n 3"], js.ControlMesh]:
     scan, mesh = fitting.example("femur_distal")
-    points = np.asarray(scan.drawn(n).points)
+    points = np.asarray(scan.draw(n).points)
     return points + np.random.default_rng(1).normal(scale=sigma, size=points.shape), mesh
 
 
@@ -201,7 +201,7 @@ def mirrored(shared: Path) -> Situation:
 def other_anatomy(scan: str, template: str) -> Callable[[Path], Situation]:
     def make(shared: Path) -> Situation:
         points = fitting.read_scan(shared / "data" / scan)
-        return Situation(points.drawn(6000), _template(shared, template), {"levels": 2}, wrong=True)
+        return Situation(points.draw(6000), _template(shared, template), {"levels": 2}, wrong=True)
 
     return make
 
@@ -313,7 +313,7 @@ def cut_short(shared: Path) -> Situation:
 
 def skull_box(shared: Path) -> Situation:
     scan = fitting.read_scan(shared / "data" / "skulls" / "A_J.ply")
-    return Situation(scan.drawn(12_000), None, {"levels": 2, "faces": 400, "closed": True}, wrong=True)
+    return Situation(scan.draw(12_000), None, {"levels": 2, "faces": 400, "closed": True}, wrong=True)
 
 
 def swapped_landmarks(shared: Path) -> Situation:

@@ -40,10 +40,16 @@ class Place(NamedTuple):
     """Control vertices where the fit started."""
     edge: Float[Array, ""]
     """Length of a control edge there, in mm."""
+    before: js.RefinedSurface | None = None
+    """The level before the last, where its normals are those of the surface: who asks for these alone spares a program
+    the normals of the last level, which cost most."""
 
     @property
     def mesh(self) -> js.RefinedSurface:
-        """A surface that has the control vertices on it: the refined one, or the control mesh of a dual scheme."""
+        """A surface that has the control vertices and those of the first level on it, if there are two levels or more:
+        the refined one or an earlier level of it, or the control mesh of a dual scheme."""
+        if self.before is not None:
+            return self.before
         if self.scheme.is_primal and self.surface is not None:
             return self.surface
         normals = js.estimate_normals(self.topology.control_fans, self.control.vertices)
@@ -80,11 +86,11 @@ class AbstractPrior(eqx.Module):
         """The prior with its tables, built in numpy; it may raise."""
         raise NotImplementedError
 
-    def shared(self) -> dict[str, Shared]:
+    def shared_unknowns(self) -> dict[str, Shared]:
         """The unknowns that the prior brings along, which all rows share."""
         return {}
 
-    def initial(self) -> dict[str, Array]:
+    def initial_values(self) -> dict[str, Array]:
         """Values of those that last, where the fit starts."""
         return {}
 
@@ -100,7 +106,7 @@ class AbstractPrior(eqx.Module):
         """1 / variance of the rows: an array of them, or one for all."""
         raise NotImplementedError
 
-    def bare(self) -> "AbstractPrior":
+    def strip_strengths(self) -> "AbstractPrior":
         """The prior without what only its strengths depend on: whether those are given or found, one compiled program
         has its rows."""
         return self
@@ -130,7 +136,7 @@ class AbstractFacePrior(AbstractPrior):
         """The control face of every row."""
         raise NotImplementedError
 
-    def by_shifts(self, held: Any) -> sp.csr_array | None:
+    def differentiate_shifts(self, held: Any) -> sp.csr_array | None:
         """Derivatives of the rows by the shifts of slices, two a slice; None where there are none."""
         return None
 

@@ -48,7 +48,7 @@ class Bend(AbstractFacePrior):
         usual, n_faces = np.mean(bends**2), start.topology.n_control_faces
         return cls(edges, faces, expected, priors.bend, likeness, np.asarray(usual), n_faces)
 
-    def bare(self) -> "Bend":
+    def strip_strengths(self) -> "Bend":
         nothing = np.zeros(())
         return dataclasses.replace(self, given=nothing, likeness=nothing, usual=nothing)
 

@@ -52,7 +52,7 @@ def boundary_of(mesh: js.ControlMesh | js.RefinedSurface) -> Float[np.ndarray, "
     return np.asarray(mesh.vertices, np.float64)[rows]
 
 
-def checked_curve(curve: BoundaryCurve, topology: js.Topology) -> BoundaryCurve:
+def check_curve(curve: BoundaryCurve, topology: js.Topology) -> BoundaryCurve:
     """The curve as float64.
 
     Raises:

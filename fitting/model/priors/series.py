@@ -48,7 +48,7 @@ class SeriesPrior(AbstractVertexPrior):
         apart = np.repeat(frames.offsets[frames.pairs[:, 1]] - frames.offsets[frames.pairs[:, 0]], len(own), axis=0)
         return cls(before, after, apart, priors.frame_change, edge)
 
-    def bare(self) -> "SeriesPrior":
+    def strip_strengths(self) -> "SeriesPrior":
         return dataclasses.replace(self, deviation=None)
 
     @property

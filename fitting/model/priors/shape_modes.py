@@ -68,7 +68,9 @@ class ShapeModes(eqx.Module):
         if not isinstance(value, Modes):
             return value
         some = value.deviations > 1e-6 * value.deviations.max()
-        rest = max(_beside_others(value.aligned), _LEAST * float(np.max(value.deviations)) / len(value.mean) ** 0.5)
+        rest = max(
+            _deviation_left_out(value.aligned), _LEAST * float(np.max(value.deviations)) / len(value.mean) ** 0.5
+        )
         return ShapeModes(value.mean, value.modes[some], value.deviations[some], rest)
 
 
@@ -89,7 +91,7 @@ def find_scores(mean: AnyArray, modes: AnyArray, vertices: AnyArray) -> Float[np
     return scores
 
 
-def _beside_others(shapes: Float[np.ndarray, "s v 3"]) -> float:
+def _deviation_left_out(shapes: Float[np.ndarray, "s v 3"]) -> float:
     """How far shapes lie beside the modes of the other shapes, root mean square in each coordinate, in mm."""
     squares = []
     for i, own in enumerate(shapes):
@@ -154,7 +156,7 @@ class ShapePrior(AbstractVertexPrior):
         first = jnp.asarray(find_scores(shape.mean, modes, start.control.vertices), dtype)
         return cls(shape.mean.astype(dtype), modes.astype(dtype), first, shape.rest, widest / edge, edge)
 
-    def bare(self) -> "ShapePrior":
+    def strip_strengths(self) -> "ShapePrior":
         return dataclasses.replace(self, rest=None)
 
     @property
@@ -171,10 +173,10 @@ class ShapePrior(AbstractVertexPrior):
     def strength_rows(self) -> Int[AnyArray, "m"]:
         return np.append(np.zeros(self.mean.size, int), np.full(len(self.modes), -1))
 
-    def shared(self) -> dict[str, Shared]:
+    def shared_unknowns(self) -> dict[str, Shared]:
         return {"scores": Shared((len(self.modes),), lever=self.widest), "pose": Shared((6,), lasting=False)}
 
-    def initial(self) -> dict[str, Array]:
+    def initial_values(self) -> dict[str, Array]:
         return {"scores": self.first}
 
     def hold(self, place: Place, strengths: dict[str, Any]) -> _Held:

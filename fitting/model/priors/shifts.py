@@ -55,10 +55,10 @@ class ShiftPrior(AbstractVertexPrior):
             return None
         return cls(slices.numbers, slices.planes, np.asarray(min(float(priors.shift), _FARTHEST)))
 
-    def shared(self) -> dict[str, Shared]:
+    def shared_unknowns(self) -> dict[str, Shared]:
         return {"shifts": Shared((len(self.numbers), 2)), "motion": Shared((3,), lasting=False, common=True)}
 
-    def initial(self) -> dict[str, Array]:
+    def initial_values(self) -> dict[str, Array]:
         return {"shifts": jnp.zeros((len(self.numbers), 2))}
 
     def rows(self, place: Place, held: None) -> Float[Array, "m"]:

@@ -32,7 +32,7 @@ class Plane(NamedTuple):
     normal: Float[Array | np.ndarray, "3"]
     """Of unit length."""
 
-    def mirrored(self, points: AnyArray) -> AnyArray:
+    def mirror(self, points: AnyArray) -> AnyArray:
         """Points `[p, 3]` on the other side."""
         return points - 2 * ((points - self.middle[None]) @ self.normal)[:, None] * self.normal[None]
 
@@ -44,14 +44,14 @@ class Symmetry(NamedTuple):
     """Of every control vertex the one on the other side; itself where it lies on the plane."""
     plane: Plane
 
-    def mirrored(self, vertices: ArrayLike) -> Float[np.ndarray, "v 3"]:
+    def mirror(self, vertices: ArrayLike) -> Float[np.ndarray, "v 3"]:
         """Where the vertices of this mesh, moved, would be if each were the mirror image of its partner.
 
         The plane is the one that leaves the least root mean square between the two: the distance of these from the
         vertices is the asymmetry of the anatomy, in mm.
         """
         vertices = np.asarray(vertices, np.float64)
-        return _plane_of(self.partner, vertices).mirrored(vertices[self.partner])
+        return _plane_of(self.partner, vertices).mirror(vertices[self.partner])
 
 
 def find_symmetry(mesh: js.ControlMesh, *, tolerance: float = 0.05) -> Symmetry:
@@ -74,13 +74,13 @@ def find_symmetry(mesh: js.ControlMesh, *, tolerance: float = 0.05) -> Symmetry:
     own = np.arange(len(vertices))
     best, lonely = None, own
     for plane in _candidates(vertices, near):
-        if np.median(tree.query(plane.mirrored(probes))[0]) > _PLAUSIBLE * edge:
+        if np.median(tree.query(plane.mirror(probes))[0]) > _PLAUSIBLE * edge:
             continue
         partner = own
         for _ in range(_ROUNDS):
-            partner = np.asarray(tree.query(plane.mirrored(vertices))[1])
+            partner = np.asarray(tree.query(plane.mirror(vertices))[1])
             plane = _plane_of(partner, vertices)
-        away = np.linalg.norm(plane.mirrored(vertices[partner]) - vertices, axis=1)
+        away = np.linalg.norm(plane.mirror(vertices[partner]) - vertices, axis=1)
         alone = np.flatnonzero((away > near) | (partner[partner] != own))
         if (partner == own).all():  # a flat mesh is its own image in its own plane
             continue
@@ -160,7 +160,7 @@ class SymmetryPrior(AbstractVertexPrior):
         alone = np.flatnonzero(own == partner)
         return cls(left, partner[left], alone, partner, priors.symmetry, start.has_normals)
 
-    def shared(self) -> dict[str, Shared]:
+    def shared_unknowns(self) -> dict[str, Shared]:
         return {"mirror": Shared((3,), lasting=False)}
 
     def hold(self, place: Place, strengths: dict[str, Any]) -> _Held:

@@ -27,11 +27,11 @@ class TangentLength(AbstractVertexPrior):
     def make(cls, priors: Any, start: Start) -> "TangentLength | None":
         return cls(start.scheme.h, priors.h) if start.has_h else None
 
-    def shared(self) -> dict[str, Shared]:
+    def shared_unknowns(self) -> dict[str, Shared]:
         # In a sensible mesh the surface moves by about a tenth of an edge for a change of h by one.
         return {"h": Shared(self.start.shape, lever=0.1)}
 
-    def initial(self) -> dict[str, Array]:
+    def initial_values(self) -> dict[str, Array]:
         return {"h": self.start}
 
     def rows(self, place: Place, held: None) -> Float[Array, "n"]:

@@ -94,7 +94,7 @@ class ValvePrior(AbstractFacePrior):
 
     def hold(self, place: Place, strengths: dict[str, Any]) -> _Paired:
         assert place.surface is not None
-        vertices, points = place.surface.vertices, self._shifted(place)
+        vertices, points = place.surface.vertices, self._shift_points(place)
         ends = jnp.asarray(self.ends)
         start, sides = vertices[ends[:, 0]], vertices[ends[:, 1]] - vertices[ends[:, 0]]
 
@@ -114,11 +114,11 @@ class ValvePrior(AbstractFacePrior):
         """Distances across the rim over their standard deviation, two a point."""
         assert place.surface is not None
         a, b = (take(place.surface.vertices, jnp.asarray(self.ends)[held.side, i]) for i in (0, 1))
-        away = a + held.along[:, None] * (b - a) - self._shifted(place)
+        away = a + held.along[:, None] * (b - a) - self._shift_points(place)
         across = [dot(held.directions[:, i], away)[:, 0] for i in (0, 1)]
         return jnp.stack(across, axis=1).reshape(-1) / self.deviation
 
-    def _shifted(self, place: Place) -> Float[Array, "b 3"]:
+    def _shift_points(self, place: Place) -> Float[Array, "b 3"]:
         """The points with the shifts of their slices."""
         if "shifts" not in place.shared:
             return self.points
@@ -126,7 +126,7 @@ class ValvePrior(AbstractFacePrior):
         moved = jnp.sum(place.shared["shifts"].astype(planes.dtype)[:, :, None] * planes, axis=1)
         return self.points + jnp.where((rows >= 0)[:, None], moved[jnp.maximum(rows, 0)], 0.0)
 
-    def by_shifts(self, held: _Paired) -> sp.csr_array:
+    def differentiate_shifts(self, held: _Paired) -> sp.csr_array:
         slices, planes = np.asarray(self.slices), np.asarray(self.planes, np.float64)
         moves = np.flatnonzero(slices >= 0)
         directions = np.asarray(held.directions, np.float64)[moves]

@@ -1,24 +1,9 @@
-"""The extra that images need, and how much a packed file may hold."""
-
-import importlib
-from types import ModuleType
+"""How much a packed file may hold."""
 
 from ..scan.scan import ScanError
 
 # The most bytes that one of these holds; more is announced only by what is damaged, or made to fill memory.
 DEFLATED, BZIPPED = 1032, 1 << 20
-
-
-def need(module: str) -> ModuleType:
-    """A library of the extra `images`.
-
-    Raises:
-        ImportError: it is missing; the text tells how to get it.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(f"this image needs the extra `images`: pip install 'jaxsubdiv[images]' ({error}).") from error
 
 
 def check_room(announced: int, size: int, most: int) -> None:
