@@ -5,6 +5,7 @@ import dataclasses
 import time
 import traceback
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,9 @@ from .progress import Progress
 REFUSALS = (js.MeshError, ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError)
 
 
-def fit_one(scan: Source | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str) -> dict:
+def fit_one(
+    scan: Source | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str
+) -> dict[str, Any]:
     """One fit: its row of the summary, whose status is 0, 1 for one not to be trusted, 2 for one that failed."""
     title, began = make_printable(title), time.perf_counter()
     try:
@@ -41,7 +44,9 @@ def fit_one(scan: Source | None, folder: Path, options: argparse.Namespace, reci
     return {"scan": title, "status": status, "seconds": f"{time.perf_counter() - began:.1f}"}
 
 
-def _fit_and_save(scan: Source | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str) -> dict:
+def _fit_and_save(
+    scan: Source | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str
+) -> dict[str, Any]:
     began = time.perf_counter()
     job = read_inputs(scan, options, recipe)
     slices = "" if job.scan.slices is None else f" in {len(np.unique(job.scan.slices))} slices"
@@ -99,7 +104,7 @@ def is_done(folder: Path, marks: dict[str, str]) -> bool:
     return True
 
 
-def make_row(name: str, result: FitResult, off: float, seconds: float | None) -> dict:
+def make_row(name: str, result: FitResult, off: float, seconds: float | None) -> dict[str, Any]:
     report = result.report()
     return {
         "scan": name,

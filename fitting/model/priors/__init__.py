@@ -86,7 +86,7 @@ class Priors(eqx.Module):
     frame_change: Float[Array, ""] | None = eqx.field(converter=_if_given, default=None)
     shape: ShapeModes | None = eqx.field(converter=ShapeModes.of, default=None)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         check_numbers(
             {name: getattr(self, name) for name in ("bend", "stretch", "symmetry", "shift", "frame_change", "likeness")}
         )
