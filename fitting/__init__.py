@@ -77,6 +77,7 @@ from .scan.landmarks import Landmarks as Landmarks
 from .scan.landmarks import match_landmarks as match_landmarks
 from .scan.landmarks import read_landmarks as read_landmarks
 from .scan.landmarks import write_landmarks as write_landmarks
+from .scan.outside import choose_outside as choose_outside
 from .scan.regions import RegionMatch as RegionMatch
 from .scan.regions import match_regions as match_regions
 from .scan.scan import Scan as Scan

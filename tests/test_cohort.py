@@ -13,6 +13,7 @@ import scans
 
 import fitting
 import jaxsubdiv as js
+from fitting.run.buckets import find_size_class, sort_into_classes
 from fitting.run.pilot import is_its_own_start
 
 N_SUBJECTS, SIZES = 3, (600, 500, 550)
@@ -126,6 +127,65 @@ def test_what_did_not_converge_is_told():
         found = fitted(tolerance=0.0)
     assert not found.converged.any() and np.all(found.sweeps == 40)
     assert not found.result(0).report().converged
+
+
+class Stopped(Exception):
+    """As if by Ctrl-C."""
+
+
+def test_a_cohort_that_was_stopped_goes_on(tmp_path):
+    """Bucket by bucket, to the same result bit for bit; and the folder holds the fits alone in the end."""
+
+    def stop_at(words: str, told: list[str]):
+        def stop(stage: str) -> None:
+            told.append(stage)
+            if stage.startswith(words):
+                raise Stopped
+
+        return stop
+
+    options = {"priors": None, "pilot": pilot(), "checkpoint": tmp_path}
+    whole, told = fitted(priors=None, pilot=pilot()), []
+    for words in ("finds", "fits", "1 of 3", "2 of 3"):
+        with pytest.raises(Stopped):
+            fitted(on_stage=stop_at(words, told), **options)
+    assert sum(stage.startswith("fits 3 scans of up to 1,024 points, 1 at once, in ") for stage in told) == 3
+    found = fitted(on_stage=told.append, **options)
+    assert told[-4:] == ["1 of 3 scans are fitted", "2 of 3 scans are fitted", told[-2], "3 of 3 scans are fitted"]
+    for name in ("converged", "sweeps", "noise", "rms", "robust_rms", "weights", "h"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+    np.testing.assert_array_equal(found.control.vertices, whole.control.vertices)
+    np.testing.assert_array_equal(found.result(2).distances, whole.result(2).distances)
+    for other in ({"tolerance": 0.02}, {"chosen": subjects()[:2]}):
+        with pytest.raises(ValueError, match=r"of another fit, with another (tolerance|scan or what belongs to it)"):
+            fitted(**(options | other))
+    found.save(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"cohort.json", *found.names}
+
+
+def test_scans_of_other_sizes_are_fitted_in_classes_of_their_own(monkeypatch):
+    assert [find_size_class(n) for n in (3, 1024, 1025, 1280, 1281)] == [1024, 1024, 1280, 1280, 1600]
+    assert sort_into_classes([1500, 900, 1300, 5000]) == [(1600, [1, 0, 2]), (6102, [3])]  # few scans join a class
+    assert [size for size, _ in sort_into_classes([900] * 8 + [1300])] == [1024, 1600]
+    monkeypatch.setattr("fitting.run.buckets._FEW", 1)
+    points = np.array(js.sample(truths()[2], 1100, jnp.array([1, 1], jnp.uint32)).points)
+    points += np.random.default_rng(1).normal(scale=scans.SIGMA, size=points.shape)
+    told = []
+    found = fitted((fitting.Scan(points), subjects()[0]), on_stage=told.append)
+    assert [words.split(",")[0] for words in told if words.startswith("fits")] == ["fits 1 scans of up to 1"] * 2
+    np.testing.assert_array_equal(found.control.vertices[1], cohort().control.vertices[0])
+    assert found.weights.shape == (2, 1280) and not found.weights[1, SIZES[0] :].any()
+    assert off(truths()[2], surface(found, 0)) < scans.SIGMA
+
+
+def test_a_bad_scan_is_left_out_and_named():
+    few = fitting.Scan(np.eye(3))
+    with pytest.warns(UserWarning, match=r"1 of 3 scans are left out\. b: the scan has 3 points for 12"):
+        found = fitted((subjects()[0], few, subjects()[2]), names="abc", skip_bad=True)
+    assert found.names == ("a", "c") and len(found) == 2 and "3 points" in found.failed["b"]
+    np.testing.assert_array_equal(found.control.vertices[1], cohort().control.vertices[2])
+    with pytest.raises(fitting.ScanError, match="none of the scans can be fitted"):
+        fitted((few,), skip_bad=True)
 
 
 def test_result_is_that_of_a_fit(tmp_path):

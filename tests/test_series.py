@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import io
+from typing import Any
 
 import beating
 import equinox as eqx
@@ -185,6 +186,35 @@ def test_what_cannot_be_fitted_is_named(truth):
         fit(scans, template, priors=fitting.Priors(symmetry=1.0))
 
 
+class Stopped(Exception):
+    """As if by Ctrl-C."""
+
+
+def test_a_series_that_was_stopped_goes_on(truth, tmp_path):
+    _, scans, template = truth
+    told, numbers = [], []
+
+    def stop(sweep: fitting.Sweep) -> None:
+        if sweep.number > 1:
+            raise Stopped
+
+    how: dict[str, Any] = {"periodic": True, "levels": 2, "max_sweeps": 3, "pose": None, "throw": False}
+    whole = fitting.fit_series(scans, template, **how)
+    how["checkpoint"] = tmp_path
+    with pytest.raises(Stopped):
+        fitting.fit_series(scans, template, on_sweep=stop, **how)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint.npz", "checkpoint_start.npz"]
+    with pytest.raises(ValueError, match=r"checkpoint_start\.npz is of another fit, with another periodic\. Start"):
+        fitting.fit_series(scans, template, **(how | {"periodic": False}))
+    again = fitting.fit_series(
+        scans, template, on_sweep=lambda sweep: numbers.append(sweep.number), on_stage=told.append, **how
+    )
+    assert numbers == [2, 3] and told[0] == "goes on where it was stopped" and len(told) == 2
+    np.testing.assert_array_equal(again.result.control.vertices, whole.result.control.vertices)
+    np.testing.assert_array_equal(again.result.rms, whole.result.rms)
+    assert not list(tmp_path.iterdir())
+
+
 def test_few_points_warn_and_name_the_frame(truth):
     from fitting.run.series import _check_frames
 
@@ -231,6 +261,11 @@ def test_the_command_fits_a_folder_of_frames(found, truth, tmp_path, capsys, mon
     assert page.count("<svg") == 6 and "data:image/gif;base64," in page and page.count("<tr>") == N + 1
     image = pytest.importorskip("PIL.Image").open(io.BytesIO((out / "series.gif").read_bytes()))
     assert image.n_frames == 2 * N
+    assert not [path for path in out.iterdir() if path.name.startswith((".", "checkpoint"))]
+    again = [*arguments, "--periodic", "--max-sweeps", "2", "-o", str(out), "--resume"]
+    assert command(again) == 1 and "done     before" in capsys.readouterr().out
+    assert command([*again, "--h", "1.1"]) == 2
+    assert "holds a fit with another frames. Without --resume" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("command_settings")

@@ -7,22 +7,22 @@ from pathlib import Path
 import jaxsubdiv as js
 
 from ..report.animation import animate_series
-from ..report.series import SeriesFit
+from ..report.series import SeriesFit, load_series
 from ..report.series_page import write_series_page
-from ..run.folder import ANIMATION, PAGE_OF_SERIES, TABLE_OF_SERIES, fill_folder, reserve_folder
+from ..run.checkpoint import marks_of
+from ..run.folder import ANIMATION, FRAMES, PAGE_OF_SERIES, TABLE_OF_SERIES, fill_folder, reserve_folder
 from ..run.names import name_folders
 from ..run.recipe import Recipe
 from ..run.series import fit_series
-from .inputs import Source, read_inputs
+from .inputs import Source, mark_job, read_inputs
 from .messages import print_regions, print_warnings, report_failure
-from .one import REFUSALS
+from .one import REFUSALS, is_done
 from .progress import Progress
 
-_FRAMES = "frames"
 # Options that a series has no use for, and their values where they are not given.
 _UNUSED = {"tolerance": None, "points": None, "boundary": None, "landmarks": None, "carry": None, "mirror": False}
 _UNUSED |= {"surface_tolerance": None, "tetrahedra": None, "patches": None}
-_UNUSED |= {"resume": False, "symmetry": None, "prior": None, "template_out": None}
+_UNUSED |= {"symmetry": None, "prior": None, "template_out": None}
 
 
 def fit_frames(scans: list[Source], options: argparse.Namespace, recipe: Recipe) -> int:
@@ -47,6 +47,13 @@ def _fit_and_save(scans: list[Source], folder: Path, options: argparse.Namespace
     mesh = jobs[0].mesh
     assert mesh is not None
     print_regions(jobs[0].scan, mesh, jobs[0].regions)
+    own = {"frames": [mark_job(job, recipe, options) for job in jobs], "names of the frames": names}
+    marks = marks_of(own | {"periodic": options.periodic, "valves": options.valves, "levels": options.levels})
+    if options.resume and is_done(folder, marks):
+        print(f"done     before, in {folder}")
+        found = load_series(folder)
+        print_warnings(found.result)
+        return 0 if found.result.trusted else 1
     with Progress(recipe.max_sweeps) as progress:
         found = fit_series(
             [job.scan for job in jobs],
@@ -66,22 +73,23 @@ def _fit_and_save(scans: list[Source], folder: Path, options: argparse.Namespace
             throw=False,
             on_stage=progress.stage,
             on_sweep=progress.update,
+            checkpoint=folder,
+            keep_checkpoint=True,
         )
     print(f"done     in {time.perf_counter() - began:.1f} s\n\n{found.table}\n")
-    _save(folder, found)
+    _save(folder, found, marks)
     print_warnings(found.result)
     return 0 if found.result.trusted else 1
 
 
-def _save(folder: Path, found: SeriesFit) -> None:
-    """The series as files, all of them in place of those of an earlier one, or none; and those of every frame."""
-    frames = folder / _FRAMES
-    frames.mkdir(exist_ok=True)
-    for number, name in enumerate(found.names):
-        js.write_mesh(frames / f"{name}.obj", found.control_mesh(number), frame=found.result.scan.frame)
-        js.write_mesh(frames / f"{name}.ply", found.surface(number), frame=found.result.scan.frame)
+def _save(folder: Path, found: SeriesFit, marks: dict[str, str]) -> None:
+    """The series and its frames as files, all of them in place of those of an earlier one, or none."""
     with fill_folder(folder) as new:
-        found.save(new)
+        (new / FRAMES).mkdir()
+        for number, name in enumerate(found.names):
+            js.write_mesh(new / FRAMES / f"{name}.obj", found.control_mesh(number), frame=found.result.scan.frame)
+            js.write_mesh(new / FRAMES / f"{name}.ply", found.surface(number), frame=found.result.scan.frame)
+        found.save(new, marks=marks)
         found.table.write_csv(new / TABLE_OF_SERIES)
         animation = None
         try:
@@ -90,4 +98,4 @@ def _save(folder: Path, found: SeriesFit) -> None:
         except ImportError as error:
             print(f"note     no animation: {error}")
         write_series_page(new / PAGE_OF_SERIES, found, title=folder.name, animation=animation)
-    print(f"wrote    the series, and {_FRAMES}/ with the control mesh and surface of every frame, in {folder}")
+    print(f"wrote    the series, and {FRAMES}/ with the control mesh and surface of every frame, in {folder}")

@@ -21,6 +21,7 @@ from ..run.recipe import Recipe, find_fits, load
 from ..scan.example import example
 from ..scan.landmarks import FramedLandmarks, Landmarks, match_landmarks, read_framed_landmarks, read_landmarks
 from ..scan.layers import read_layers
+from ..scan.outside import choose_outside
 from ..scan.regions import Groups, match_regions, read_groups
 from ..scan.scan import Scan
 
@@ -97,6 +98,10 @@ def read_inputs(scan: Source | None, options: argparse.Namespace, recipe: Recipe
         points = seen.scan
     else:
         points = read_scan(file, scale=options.scale, labels=options.labels, label=options.label, above=options.above)
+    if options.outside:
+        n = points.n_points
+        points = choose_outside(points)
+        print(f"outside  {points.n_points:,} of {n:,} points are seen from there")
     mesh, of_mesh = _read_template(options, recipe, points.frame)
     landmarks = carried = None
     if (options.landmarks is None) != (options.control_landmarks is None) or (options.landmarks and mesh is None):

@@ -66,9 +66,9 @@ def _main(arguments: Sequence[str] | None) -> int:
         return fit_one(scan, folder, options, recipe, scan.title() if scan else options.example)["status"]
     except KeyboardInterrupt:
         again = "the same command goes on from the last sweep"
-        if options.series or options.template_out:
+        if options.template_out:
             again = "the same command begins anew"
-        elif len(scans) > 1:
+        elif len(scans) > 1 and not options.series:
             again += "; with --resume it skips the scans that are done"
         print(f"\nstopped  {again}", file=sys.stderr)
         return 130

@@ -57,8 +57,8 @@ def _fit_and_save(
     if job.seen is not None or (job.layered is not None and scan is not None and is_image(scan.path)):
         recipe = suggest_for_image(recipe, job.scan, options)
     marks = mark_job(job, recipe, options)
-    done = find_done(folder, marks) if options.resume else None
-    if done is not None:
+    if options.resume and is_done(folder, marks):
+        done = load(folder)
         print(f"done     before, in {folder}")
         print_warnings(done)
         return make_row(title, done, misfit(done), None, options.details)
@@ -90,14 +90,14 @@ def _fit_and_save(
     return make_row(title, found.result, off, seconds, options.details)
 
 
-def find_done(folder: Path, marks: dict[str, str]) -> FitResult | None:
-    """The fit in a folder that would come out again; None where there is none, or one that was stopped.
+def is_done(folder: Path, marks: dict[str, str]) -> bool:
+    """Whether a folder holds the fit that would come out again; not where there is none, or one that was stopped.
 
     Raises:
         ValueError: there is one of other inputs, or it does not say of which.
     """
     if is_unfinished(folder) or not (folder / FIT).exists():
-        return None
+        return False
     then = read_marks(folder)
     others = f"with another {', another '.join(find_differing(then, marks))}" if then else "that does not say of what"
     if then != marks:
@@ -105,7 +105,7 @@ def find_done(folder: Path, marks: dict[str, str]) -> FitResult | None:
             f"{folder} holds a fit {others}. Without --resume it is fitted anew and replaced; or give another folder "
             "with -o."
         )
-    return load(folder)
+    return True
 
 
 def make_row(name: str, result: FitResult, off: float, seconds: float | None, details: bool) -> dict[str, Any]:

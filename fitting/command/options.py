@@ -63,6 +63,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("--kind", choices=("triangle", "quad"), help=f"of these faces (default: {Recipe.kind})")
     add("--closed", action=argparse.BooleanOptionalAction, help="whether the anatomy is; default: found from the scan")
     add("--part", choices=get_args(PartKind), help="of a scan that shows several; default: the largest, with a warning")
+    add("--outside", action="store_true", help="fit the points that are seen from outside alone, as of a skull's shell")
     add("--mirror", action="store_true", help="fit the template's mirror image: that of the other side of the body")
     add("--align", choices=("similarity", "rigid", "affine", "none"), help=f"of the template (default: {Recipe.pose})")
     add("--landmarks", metavar="FILE", help="named places on the scan: .mrk.json .json .csv .tsv .fcsv")
@@ -161,7 +162,7 @@ def make_parser() -> argparse.ArgumentParser:
     add(
         "--resume",
         action="store_true",
-        help="skip the scans that OUT has whole fits of, from the same inputs and options",
+        help="skip the scans, or the series, that OUT has whole fits of, from the same inputs and options",
     )
     add("--example", choices=get_args(Example), default="head_fragment", help="which, without SCAN")
     return parser

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import final
 
@@ -23,6 +23,8 @@ from ..scan.scan import Scan
 from .result import FitResult
 
 COHORT = "cohort.json"
+CHECKPOINT_OF_COHORT = "checkpoint_of_cohort_{}.npz"
+"""A file of what `fit_cohort` has finished, by what it is."""
 
 
 @final
@@ -42,6 +44,7 @@ class Cohort:
         weights: how much each point counts at the end, `[s, p]`; 0 past a scan's last point.
         scans: what was fitted.
         names: of the scans, for files; default: their numbers.
+        failed: why a scan could not be fitted, by its name, of those that were left out.
     """
 
     control: js.Control
@@ -56,6 +59,7 @@ class Cohort:
     scans: tuple[Scan, ...]
     names: tuple[str, ...]
     _results: Callable[[int], FitResult]
+    failed: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @classmethod
     def of(cls, results: Sequence[FitResult], names: Sequence[str] | None = None) -> "Cohort":
@@ -92,10 +96,10 @@ class Cohort:
             ),
             converged=np.array([bool(one.result == optx.RESULTS.successful) for one in results]),
             sweeps=np.array([len(one.rms) - 1 for one in results]),
-            rms=_pad_rows([one.rms for one in results], np.nan),
-            robust_rms=_pad_rows([one.robust_rms for one in results], np.nan),
+            rms=pad_rows([one.rms for one in results], np.nan),
+            robust_rms=pad_rows([one.robust_rms for one in results], np.nan),
             noise=np.array([one.noise for one in results]),
-            weights=_pad_rows([one.weights for one in results], 0.0),
+            weights=pad_rows([one.weights for one in results], 0.0),
             scans=tuple(one.scan for one in results),
             names=name_subjects(len(results), names),
             _results=results.__getitem__,
@@ -112,7 +116,7 @@ class Cohort:
         """Write the fits into a folder, made where there is none, for `fitting.load_cohort`.
 
         Each fit has a folder of its name in it, as `FitResult.save` writes it, and `cohort.json` has the names in their
-        order. That file is written last.
+        order. That file is written last; then the checkpoints of `fit_cohort` that are in the folder go.
 
         Raises:
             OSError: a folder cannot be made or written.
@@ -123,6 +127,8 @@ class Cohort:
             self.result(i).save(folder / name)
         with replace_file(folder / COHORT) as path:
             path.write_text(json.dumps({"names": self.names}, indent=2) + "\n", encoding="utf-8")
+        for left in folder.glob(CHECKPOINT_OF_COHORT.format("*")):
+            left.unlink(missing_ok=True)
 
     @functools.cached_property
     def warnings(self) -> tuple[tuple[Finding, ...], ...]:
@@ -152,7 +158,7 @@ def name_subjects(n: int, names: Sequence[str] | None) -> tuple[str, ...]:
     return names
 
 
-def _pad_rows(rows: Sequence[Float[np.ndarray, "_"]], value: float) -> Float[np.ndarray, "s m"]:
+def pad_rows(rows: Sequence[Float[np.ndarray, "_"]], value: float) -> Float[np.ndarray, "s m"]:
     """Rows of different lengths as one array."""
     found = np.full((len(rows), max(map(len, rows))), value)
     for row, own in zip(found, rows, strict=True):

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from ..scan.frames import Frames
 from ..scan.scan import Scan
 from .measures import Measures
 from .result import FitResult
-from .saved import load_fit
+from .saved import load_fit, save_fit
 from .series_table import SeriesTable, measure_series
 
 _SERIES = "series.json"
@@ -124,16 +125,21 @@ class SeriesFit:
     @functools.cached_property
     def table(self) -> SeriesTable:
         """Volumes, mass, areas, thickness of the wall and displacement of every frame, with standard deviations."""
+        controls = [self.control(k) for k in range(len(self))]
         surfaces = [self.surface(k) for k in range(len(self))]
-        return measure_series(self.result, self._topology, self.frames, self.measures, surfaces, self.names)
+        return measure_series(self.result, self._topology, self.measures, controls, surfaces, self.names)
 
-    def save(self, folder: str | os.PathLike[str]) -> None:
+    def save(self, folder: str | os.PathLike[str], *, marks: Mapping[str, str] | None = None) -> None:
         """Write the fit into a folder, for `load_series`: as `FitResult.save`, and `series.json` with the names.
+
+        Args:
+            folder: made where there is none.
+            marks: of all that went into the fit, for a program that fits again only what changed.
 
         Raises:
             OSError, ValueError: as `FitResult.save`.
         """
-        self.result.save(folder)
+        save_fit(folder, self.result.fit, self.result.recipe, marks)
         with replace_file(Path(folder) / _SERIES) as path:
             path.write_text(json.dumps({"names": self.names, "valves": self.valves}, indent=2) + "\n", encoding="utf-8")
 

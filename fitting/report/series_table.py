@@ -19,7 +19,6 @@ import jaxsubdiv as js
 from jaxsubdiv.files import replace_file
 
 from ..model.unknowns import Layout, Variables
-from ..scan.frames import Frames
 from .measures import Column, Measures, Walls
 from .result import FitResult
 
@@ -76,8 +75,8 @@ class SeriesTable:
 def measure_series(
     result: FitResult,
     topology: js.Topology,
-    frames: Frames,
     measures: Measures,
+    controls: Sequence[js.Control],
     surfaces: Sequence[js.RefinedSurface],
     names: Sequence[str],
 ) -> SeriesTable:
@@ -86,20 +85,16 @@ def measure_series(
     Args:
         result: the fit of all frames.
         topology: tables of the control mesh of one frame.
-        surfaces: of the frames, in their places.
+        controls, surfaces: of the frames, in their places.
     """
     fit = result.fit
-    n, layout = len(frames.counts), fit.model.layout
+    n, layout = len(controls), fit.model.layout
     v = layout.n_vertices // n
     kept = tuple((name, of) for name, of in layout.shared if name == "h")
     own = Layout(v, layout.has_vertices, layout.has_normals, kept)
     edge = js.edge_length(fit.topology, fit.y.control.vertices)
     shared = {name: value for name, value in fit.y.shared.items() if name == "h"}
-    offsets = jnp.asarray(frames.offsets, edge.dtype)
-
-    def variables(k: int) -> Variables:
-        rows, whole = slice(k * v, (k + 1) * v), fit.y.control
-        return Variables(js.Control(whole.vertices[rows] - offsets[k][None], whole.normals[rows]), shared)
+    of_frames = [Variables(control, shared) for control in controls]
 
     def refine(vector: Float[Array, "n"], y: Variables) -> js.RefinedSurface:
         moved = own.retract(y, own.split(vector), edge)
@@ -126,12 +121,11 @@ def measure_series(
             whole[layout.columns("h")] = derivative[:, own.n_own :].T
         return whole
 
-    for k, surface in enumerate(surfaces):
+    for k, (y, surface) in enumerate(zip(of_frames, surfaces, strict=True)):
         walls = measures.walls(surface)
-        y, first = variables(k), variables(0)
         found = np.asarray(value_of(zero, y, walls), np.float64)
         by = place(np.asarray(derivative_of(zero, y, walls), np.float64), k)
-        away, by_both = change_of(jnp.stack([zero, zero]), y, first)
+        away, by_both = change_of(jnp.stack([zero, zero]), y, of_frames[0])
         by_both = np.asarray(by_both, np.float64)
         values.append([*found, float(away)])
         sides.append(np.concatenate([by, place(by_both[:1], k) + place(by_both[1:], 0)], axis=1))

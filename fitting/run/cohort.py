@@ -1,11 +1,14 @@
-"""`fit_cohort`: one control mesh fitted to many scans in one compiled call of `Sweeps`, by optimistix.
+"""`fit_cohort`: one control mesh fitted to many scans by one compiled call of `Sweeps` a bucket, by optimistix.
 
 It minimises the same rows as `fit`, with the same robust weights, annealed alike. Two things are simpler, for the sake
 of one program for all: the strengths of the priors are given, or found once by an ordinary fit; and a sweep's normal
 equations are solved by conjugate gradients, without a matrix, not further than a sweep deserves.
 """
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -13,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax import lax
+from jax.sharding import Mesh
 
 import jaxsubdiv as js
 from jaxsubdiv.errors import name_rows
@@ -28,7 +31,7 @@ from ..model.recipe import Settings
 from ..model.residual import Model, analyse
 from ..model.robust import AbstractLoss, geman_mcclure
 from ..model.unknowns import Free, Variables
-from ..report.cohort import Cohort, name_subjects
+from ..report.cohort import Cohort, name_subjects, pad_rows
 from ..report.evidence import rests_far_off
 from ..report.record import Fit, choose_faces
 from ..report.result import FitResult
@@ -37,15 +40,16 @@ from ..scan.regions import RegionMatch
 from ..scan.scan import Scan, ScanError
 from ..solve.conjugate_gradients import ConjugateGradients
 from ..solve.strengths import FromTargets
-from ..solve.sweeps import CONVERGED, NONFINITE, State, Subject, Sweeps, loose_damping, subject_residual
+from ..solve.sweeps import CONVERGED, NONFINITE, State, Sweeps, loose_damping
 from ..start.folds import Folds
+from .buckets import Kept, fit_in_buckets
 from .fit import check, check_regions, find_partners, gather_inputs, record_fit, sound_start
-from .pilot import make_pilot
-from .stack import fill_choices, fill_scene, fill_up, split_common
+from .pilot import Member, make_pilot, take_strengths
+from .stack import fill_choices, fill_up, share_equal
 
-# Of the gradient, squared sums: tighter solves of a sweep, whose pairs change anyway, take longer in all.
-_SOLVED, _MOST_STEPS = 0.03, 200
-_ROUND = 256  # scans are filled up to a multiple of it: cohorts of nearly equal lengths share a program
+# Of the gradient. Stiff priors make up most of it: where less of it is solved, the surface hardly follows the scan from
+# sweep to sweep, which looks like rest (at 0.03 a heart stopped 5 mm from its contours, `tests/bench/fit_cohorts.py`).
+_SOLVED, _MOST_STEPS = 0.001, 1000
 _T = TypeVar("_T")
 
 
@@ -68,11 +72,16 @@ def fit_cohort(
     max_sweeps: int = 60,
     tolerance: float = 0.1,
     at_once: int = 1,
+    mesh: Mesh | None = None,
+    skip_bad: bool = False,
+    on_stage: Callable[[str], None] | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
 ) -> Cohort:
-    """Fit one control mesh to many scans, in one compiled call.
+    """Fit one control mesh to many scans, by one compiled program for all scans of about a size.
 
-    Compiling takes as long as several fits, and is done again for another number of subjects. After that each takes a
-    fraction of the time of `fit`, and is as near to the truth.
+    Scans are sorted into classes by their number of points: up to 1024, and then a quarter more from class to class; a
+    few scans join the next larger class. Each class is compiled once, which takes as long as several fits. After that
+    each fit takes a fraction of the time of `fit`, and is as near to the truth.
 
     Args:
         scheme, topology: as in `fit`.
@@ -87,148 +96,189 @@ def fit_cohort(
         landmarks, boundary, regions: as in `fit`, one a scan; or one for all.
         names: of the scans, for tables and folders; default: their numbers.
         landmark_deviation, symmetry: as in `fit`, for all; symmetry is by default that of the first control mesh.
-        at_once: how many subjects share each operation, as the memory allows: on an accelerator many; on a CPU one at
-            a time is as fast, and stops when it has converged.
+        at_once: how many subjects share each operation of a device, as the memory allows: on an accelerator many; on a
+            CPU one at a time is as fast, and stops when it has converged.
+        mesh: devices, along any axes, that fit `at_once` subjects each at the same time; default: JAX's default device
+            alone. The devices may be those of several processes (`jax.distributed`), which then all call this with the
+            same arguments, and all get the whole cohort.
+        skip_bad: leave out scans that cannot be fitted, named in `Cohort.failed` with the reason, and fit the others;
+            default: refuse all.
+        on_stage: told what begins, how much memory it takes, and how many scans are done, in a few words.
+        checkpoint: a folder that keeps what was finished. Called again with the same arguments, a cohort that was
+            stopped goes on from there, to the same result bit for bit. The files go when the cohort is saved there.
 
     Warns:
-        UserWarning: some fits did not converge; it names them, and `Cohort.converged` has them. Or the control mesh was
-            fitted to the pilot's own scan, so that the pilot is replaced. Or faces of a control mesh lie upside down,
-            see `fit`.
+        UserWarning: some fits did not converge; it names them, and `Cohort.converged` has them. Or scans were left out;
+            it names them. Or the control mesh was fitted to the pilot's own scan, so that the pilot is replaced. Or
+            faces of a control mesh lie upside down, see `fit`.
 
     Raises:
         ScanError: a scan cannot be fitted; the text names it by its number. Or some have normals and others none.
-        ValueError: as in `fit`; or the numbers of scans, controls, landmarks, boundaries and regions differ.
+        ValueError: as in `fit`; or the numbers of scans, controls, landmarks, boundaries and regions differ; or the
+            checkpoint is of another cohort.
     """
     check_numbers({"max_sweeps": max_sweeps, "tolerance": tolerance, "landmark_deviation": landmark_deviation})
     check_numbers({"at_once": at_once})
-    free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
-    n = len(scans)
-    controls = _check_one_each(controls, js.Control, n, "controls")
-    for i, (control, scan) in enumerate(zip(controls, scans, strict=True)):
+    free, priors, loss, say = free or Free(), priors or Priors(), loss or geman_mcclure(), on_stage or (lambda _: None)
+    of_each = _give_each(controls, scans, landmarks, boundary, regions)
+    check_one = partial(_check, scheme, topology, free=free, deviation=landmark_deviation, sound={})
+    given, inputs, named, failed = [], [], [], {}
+    for i, (one, name) in enumerate(zip(of_each, name_subjects(len(scans), names), strict=True)):
         try:
-            check(scheme, topology, control, scan)
+            one, own = check_one(one)
         except ScanError as error:
-            raise ScanError(f"scan {i}: {error}") from error
-    given = [scan.normals is not None for scan in scans]
-    if any(given) and not all(given):
-        raise ScanError(f"scan {given.index(False)} has no normals and others have: give all of them normals, or none.")
-    sound = {}
-    for control in controls:  # mostly the same one for all
-        if id(control) not in sound:
-            sound[id(control)] = sound_start(scheme, topology, control, free)
-    controls = [sound[id(control)] for control in controls]
-    named = name_subjects(n, names)
-    places = [None] * n if landmarks is None else _check_one_each(landmarks, Landmarks, n, "landmarks")
-    curves = [None] * n if boundary is None else _check_one_each(boundary, BoundaryCurve, n, "boundaries")
-    matches = [None] * n if regions is None else _check_one_each(regions, RegionMatch, n, "regions")
-    for match in matches:
-        check_regions(match, topology)
-    partners = find_partners(symmetry, priors, topology, controls[0])
+            if not skip_bad:
+                raise ScanError(f"scan {i}: {error}") from error
+            failed[name] = str(error)
+        else:
+            given, inputs, named = [*given, one], [*inputs, own], [*named, name]
+    if failed:
+        words = "; ".join(f"{name}: {reason}" for name, reason in failed.items())
+        if not given:
+            raise ScanError(f"none of the scans can be fitted. {words}")
+        warn(f"{len(failed)} of {len(scans)} scans are left out. {words}")
+    have = [one.scan.normals is not None for one in given]
+    if any(have) and not all(have):
+        which = have.index(False)
+        raise ScanError(f"scan {which} has no normals and others have: give all of them normals, or none.")
+    partners = find_partners(symmetry, priors, topology, given[0].control)
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
     settings["landmark_deviation"] = landmark_deviation
-    inputs = []
-    for control, scan, place, curve, match in zip(controls, scans, places, curves, matches, strict=True):
-        own = gather_inputs(scheme, topology, control, scan, free, place, landmark_deviation, curve)
+    of_all = {"scheme": scheme, "topology": topology, "symmetry": partners, "scan or what belongs to it": given}
+    of_all |= {"pilot": pilot and pilot.fit.strengths, "at_once": at_once, "number of devices": mesh and mesh.size}
+    kept = Kept(None if checkpoint is None else Path(checkpoint), of_all | settings, mesh)
+    for own in inputs:
         own |= {"symmetry": partners, "alike": None if pilot is None else pilot.fit.inputs.get("alike")}
-        inputs.append(own | {"regions": match})
-    made = [
-        analyse(scheme, topology, control, free, priors, own) for control, own in zip(controls, inputs, strict=True)
-    ]
+    made = _analyse_all(scheme, topology, given, free, priors, inputs)
+    strengths = None
     if pilot is not None or any(one.n_strengths and one.given_strengths() is None for one in made[0][0].priors):
-        of_each = [
-            {"landmarks": place, "boundary": curve, "symmetry": partners, "regions": match}
-            for place, curve, match in zip(places, curves, matches, strict=True)
-        ]
-        pilot = make_pilot(scheme, topology, controls, scans, of_each, settings, pilot)
-    filled = [
-        analyse(scheme, topology, control, free, priors, own)
-        for control, own in zip(controls, fill_up(inputs), strict=True)
-    ]
-    without = () if pilot is None or priors.bend is not None or "height" in pilot.fit.strengths.values else ("height",)
+        say("finds the strengths of the priors by a fit of one scan")
+        of_pilot = {"symmetry": partners} | settings
+        strengths = kept.recall_strengths(lambda: take_strengths(make_pilot(scheme, topology, given, of_pilot, pilot)))
+    without = () if strengths is None or priors.bend is not None or "height" in strengths.values else ("height",)
+    filled = fill_up(inputs)
+    filled = made if filled is inputs else _analyse_all(scheme, topology, given, free, priors, filled)
     models = [_leave_out(model, without) for model, _ in made]
-    size = -(-max(scan.n_points for scan in scans) // _ROUND) * _ROUND
     scenes = [
-        make_scene(scan, model.refine(y), own["slices"], choose_faces(own["regions"], model, y, scan))
-        for scan, own, (model, y) in zip(scans, inputs, made, strict=True)
+        make_scene(one.scan, model.refine(y), own["slices"], choose_faces(one.regions, model, y, one.scan))
+        for one, own, (model, y) in zip(given, inputs, made, strict=True)
     ]
-    choices = fill_choices([scene.choice for scene in scenes], [scan.n_points for scan in scans])
-    has_slices = any(scene.of_points is not None for scene in scenes)
-    subjects = [
-        (_leave_out(model, without), fill_scene(scene._replace(choice=choice), size, has_slices), y)
-        for scene, choice, (model, y) in zip(scenes, choices, filled, strict=True)
-    ]
-    subjects += subjects[-1:] * (-n % at_once)
+    choices = fill_choices([scene.choice for scene in scenes], [one.scan.n_points for one in given])
     solver = Sweeps(
         linear_solver=ConjugateGradients(_SOLVED, _MOST_STEPS),
-        strengths=find_targets(models[0], priors, pilot),
+        strengths=find_targets(models[0], priors, strengths),
         loss=loss,
-        rtol=jnp.asarray(tolerance, controls[0].vertices.dtype),
+        rtol=jnp.asarray(tolerance, given[0].control.vertices.dtype),
         max_sweeps=max_sweeps,
         folds=Folds(topology),
     )
-    shared, own = split_common(subjects)
-    values, states = jax.tree.map(lambda rows: rows[:n], _run(solver, shared, own, at_once))
-    surfaces = jax.vmap(lambda y: subjects[0][0].refine(y))(values)
-    rows_of, states = jax.tree.map(np.asarray, (values, states))  # rows of JAX arrays would be one program each
-    ends = [_find_ending(models[i], scenes[i], jax.tree.map(lambda rows, i=i: rows[i], states)) for i in range(n)]
+    found = fit_in_buckets(
+        solver,
+        [(_leave_out(model, without), y) for model, y in filled],
+        [scene._replace(choice=choice) for scene, choice in zip(scenes, choices, strict=True)],
+        at_once=at_once,
+        mesh=mesh,
+        kept=kept,
+        on_stage=say,
+    )
+    ends = [_find_ending(model, scene, state) for model, scene, (_, state) in zip(models, scenes, found, strict=True)]
     converged = np.array([bool(end == optx.RESULTS.successful) for end in ends])
     if not converged.all():
         which = np.flatnonzero(~converged)
         warn(
-            f"{len(which)} of {n} fits did not converge, of the scans {name_rows(which)}: see `Cohort.converged`. "
-            "Align them better, or give more `max_sweeps`.",
+            f"{len(which)} of {len(given)} fits did not converge, of the scans {name_rows(which)}: see "
+            "`Cohort.converged`. Align them better, or give more `max_sweeps`.",
         )
     told = Settings.of(scheme, topology, **settings)
 
     def fit_of(i: int) -> Fit:
-        y, state = jax.tree.map(lambda rows: rows[i], (rows_of, states))
+        y, state = found[i]
         y = _cut(models[i], jax.tree.map(jnp.asarray, y))
-        cut = _cut_look(state.look, scans[i].n_points), _cut_hold(models[i], state)
+        cut = _cut_look(state.look, given[i].scan.n_points), _cut_hold(models[i], state)
         state = eqx.tree_at(lambda one: (one.look, one.damping.hold), state, cut)
-        return record_fit(models[i], y, state, scenes[i], scans[i], controls[i], inputs[i], told, ends[i])
+        return record_fit(models[i], y, state, scenes[i], given[i].scan, given[i].control, inputs[i], told, ends[i])
 
+    values, states = [y for y, _ in found], [state for _, state in found]
+    vertices, normals = (jnp.stack([getattr(one, name) for one in states]) for name in ("vertices", "normals"))
     return Cohort(
-        control=values.control,
-        h=values.shared.get("h"),
-        surfaces=js.RefinedSurface(surfaces.vertices, surfaces.normals, topology.faces),
+        control=jax.tree.map(lambda *rows: jnp.stack(rows), *(y.control for y in values)),
+        h=jnp.stack([y.shared["h"] for y in values]) if "h" in values[0].shared else None,
+        surfaces=js.RefinedSurface(vertices, normals, topology.faces),
         converged=converged,
-        sweeps=states.sweep - 1,
-        rms=states.rms,
-        robust_rms=states.robust_rms,
-        noise=states.look.noise,
-        weights=states.look.weights,
-        scans=tuple(scans),
-        names=named,
+        sweeps=np.array([int(state.sweep) - 1 for state in states]),
+        rms=np.stack([state.rms for state in states]),
+        robust_rms=np.stack([state.robust_rms for state in states]),
+        noise=np.array([float(state.look.noise) for state in states]),
+        weights=pad_rows([np.asarray(state.look.weights) for state in states], 0.0),
+        scans=tuple(one.scan for one in given),
+        names=tuple(named),
+        failed=failed,
         _results=lambda i: FitResult(fit_of(i)),
     )
 
 
-def find_targets(model: Model, priors: Priors, pilot: FitResult | None) -> FromTargets:
+def find_targets(model: Model, priors: Priors, pilot: FromTargets | None) -> FromTargets:
     """Strengths of the priors, and what is expected of bends: as given, or as the pilot found them."""
-    told = {} if pilot is None else pilot.fit.strengths.values
+    pilot = pilot or FromTargets({}, 0.0, 0.0)
     values = {}
     for prior in model.priors:
         if prior.n_strengths:
             given = prior.given_strengths()
-            values[prior.name] = told.get(prior.name, prior.first_strengths()) if given is None else given
+            values[prior.name] = pilot.values.get(prior.name, prior.first_strengths()) if given is None else given
     likeness = priors.likeness
     if likeness is None:
-        likeness = told.get("likeness", 0.0) if priors.bend is None else 0.0
-    determined = 0.0 if pilot is None else pilot.fit.strengths.determined
-    dtype = model.template.dtype
-    values, likeness, determined = jax.tree.map(lambda x: jnp.asarray(x, dtype), (values, likeness, determined))
-    return FromTargets(values, likeness, determined)
+        likeness = pilot.likeness if priors.bend is None else 0.0
+    targets = FromTargets(values, likeness, pilot.determined)
+    return jax.tree.map(lambda x: jnp.asarray(x, model.template.dtype), targets)
 
 
-@eqx.filter_jit
-def _run(solver: Sweeps, shared: Any, own: Any, at_once: int) -> tuple[Variables, State]:
-    def fit_one(own: Any) -> tuple[Variables, State]:
-        model, scene, y = eqx.combine(shared, own)
-        subject = Subject(model, scene)
-        found = optx.least_squares(subject_residual, solver, y, subject, max_steps=None, throw=False)
-        return found.value, found.stats["state"]
+def _give_each(controls: Any, scans: Sequence[Scan], landmarks: Any, boundary: Any, regions: Any) -> list[Member]:
+    """What belongs to each scan, of what was given for all or for each."""
+    n = len(scans)
+    controls = _check_one_each(controls, js.Control, n, "controls")
+    places = [None] * n if landmarks is None else _check_one_each(landmarks, Landmarks, n, "landmarks")
+    curves = [None] * n if boundary is None else _check_one_each(boundary, BoundaryCurve, n, "boundaries")
+    matches = [None] * n if regions is None else _check_one_each(regions, RegionMatch, n, "regions")
+    return [Member(*one) for one in zip(controls, scans, places, curves, matches, strict=True)]
 
-    return lax.map(fit_one, own, batch_size=None if at_once == 1 else at_once)
+
+def _check(
+    scheme: js.AbstractScheme,
+    topology: js.Topology,
+    one: Member,
+    *,
+    free: Free,
+    deviation: float,
+    sound: dict[int, js.Control],
+) -> tuple[Member, dict[str, Any]]:
+    """A subject with a sound start, and its inputs.
+
+    Args:
+        sound: the starts that are sound, by the identity of those that were given; new ones are put in.
+    """
+    check(scheme, topology, one.control, one.scan)
+    check_regions(one.regions, topology)
+    if id(one.control) not in sound:
+        sound[id(one.control)] = sound_start(scheme, topology, one.control, free)
+    one = one._replace(control=sound[id(one.control)])
+    inputs = gather_inputs(scheme, topology, one.control, one.scan, free, one.landmarks, deviation, one.boundary)
+    return one, inputs | {"regions": one.regions}
+
+
+def _analyse_all(
+    scheme: js.AbstractScheme,
+    topology: js.Topology,
+    given: list[Member],
+    free: Free,
+    priors: Priors,
+    inputs: list[dict[str, Any]],
+) -> list[tuple[Model, Variables]]:
+    """The models of all subjects, which share the tables that are alike."""
+    made: list[tuple[Model, Variables]] = []
+    for one, own in zip(given, inputs, strict=True):
+        new = analyse(scheme, topology, one.control, free, priors, own)
+        made.append(share_equal(new, made[0]) if made else new)
+    return made
 
 
 def _find_ending(model: Model, scene: Scene, state: State) -> optx.RESULTS:

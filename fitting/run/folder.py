@@ -24,6 +24,8 @@ LANDMARKS, CARRIED = "landmarks.mrk.json", "landmarks.csv"
 TETRAHEDRA, PATCHES = "tetrahedra.vtu", ("patches.vtu", "patches.xml")
 TABLE_OF_SERIES, PAGE_OF_SERIES, NAMES_OF_SERIES = "series.csv", "series.html", "series.json"
 ANIMATION = "series.gif"
+FRAMES = "frames"
+"""The folder in that of a series with the files of every frame."""
 RESULTS = ("control.obj", "surface.ply", "report.json", "fit.html", "recipe.json", "fit.png", FIT)
 """Of a fit without options."""
 _SERIES = (TABLE_OF_SERIES, PAGE_OF_SERIES, NAMES_OF_SERIES, ANIMATION)
@@ -94,6 +96,7 @@ def _clean(folder: Path) -> None:
     """Remove what a killed run was writing; files of other names are somebody's own."""
     for left in folder.glob(f"{_UNFINISHED}*/"):
         with suppress(OSError):
+            shutil.rmtree(left / FRAMES, ignore_errors=True)
             for name in _OURS:
                 (left / name).unlink(missing_ok=True)
             left.rmdir()
@@ -116,6 +119,10 @@ def fill_folder(folder: Path) -> Iterator[Path]:
     new = Path(tempfile.mkdtemp(prefix=_UNFINISHED, dir=folder))
     try:
         yield new
+        if (new / FRAMES).is_dir():  # file by file: the folder may hold others
+            (folder / FRAMES).mkdir(exist_ok=True)
+            for file in (new / FRAMES).iterdir():
+                os.replace(file, folder / FRAMES / file.name)
         for name in _PLACED:
             if (new / name).exists():
                 os.replace(new / name, folder / name)

@@ -2,16 +2,20 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import jaxsubdiv as js
 from jaxsubdiv.notices import warn
 
+from ..model.priors.boundary import BoundaryCurve
 from ..report.result import FitResult
 from ..scan.closest_points import closest_points
+from ..scan.landmarks import Landmarks
+from ..scan.regions import RegionMatch
 from ..scan.scan import Scan
+from ..solve.strengths import FromTargets
 from .fit import fit
 
 # A start that is the fit of the pilot's own scan is expected to return bit by bit, noise included: the scan is found
@@ -20,12 +24,20 @@ from .fit import fit
 _LIKE, _HARDLY_MOVED, _NOTHING_LEFT = 0.5, 0.5, 0.03  # the last in control edges
 
 
+class Member(NamedTuple):
+    """What belongs to one scan of a cohort, as `fit` takes it."""
+
+    control: js.Control
+    scan: Scan
+    landmarks: Landmarks | None
+    boundary: BoundaryCurve | None
+    regions: RegionMatch | None
+
+
 def make_pilot(
     scheme: js.AbstractScheme,
     topology: js.Topology,
-    controls: Sequence[js.Control],
-    scans: Sequence[Scan],
-    of_each: Sequence[dict[str, Any]],
+    subjects: Sequence[Member],
     settings: dict[str, Any],
     given: FitResult | None = None,
 ) -> FitResult:
@@ -36,8 +48,7 @@ def make_pilot(
     the same one without expecting the shape of the start.
 
     Args:
-        of_each: landmarks, boundary, symmetry and regions of each scan, as `fit` takes them.
-        settings: what else `fit` takes.
+        settings: what else `fit` takes, the same for all.
         given: the pilot to use, if it is of use.
 
     Warns:
@@ -45,16 +56,16 @@ def make_pilot(
     """
 
     def fit_one(i: int, **other: Any) -> FitResult:
-        return fit(scheme, topology, controls[i], scans[i], throw=False, **(settings | of_each[i] | other))
+        return fit(scheme, topology, throw=False, **(subjects[i]._asdict() | settings | other))
 
     pilot = fit_one(0) if given is None else given
     if settings["priors"].likeness is not None or not is_its_own_start(pilot):
         return pilot
-    if len(scans) == 1:
+    if len(subjects) == 1:
         other = fit_one(0, priors=dataclasses.replace(settings["priors"], likeness=0.0))
         how = "nothing of the start's own shape was expected: as by Priors(likeness=0)"
     else:
-        off = [_distance(scheme, topology, *one) for one in zip(controls, scans, strict=True)]
+        off = [_distance(scheme, topology, one.control, one.scan) for one in subjects]
         farthest = int(np.argmax(off))
         other = fit_one(farthest)
         how = f"that of scan {farthest} was taken instead, which lies farthest from its start"
@@ -63,6 +74,13 @@ def make_pilot(
         f"differ: {how}. Start from a template or a mean, or give a pilot of another scan.",
     )
     return other
+
+
+def take_strengths(pilot: FitResult) -> FromTargets:
+    """What a pilot tells of the fits of other scans of the kind."""
+    values = dict(pilot.fit.strengths.values)
+    likeness = values.pop("likeness")
+    return FromTargets(values, likeness, pilot.fit.strengths.determined)
 
 
 def is_its_own_start(pilot: FitResult) -> bool:

@@ -1,7 +1,10 @@
 """`fit_series`: one anatomy in many frames, fitted at once by one control mesh."""
 
 import dataclasses
+import os
 from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -32,8 +35,20 @@ from ..solve.strengths import FromTargets
 from ..solve.sweeps import Subject, subject_residual
 from ..start.align import Kind, align
 from ..start.cavities import find_parts, find_valves
-from .fit import Sweep, check, fit, gather_inputs, make_solver, record_fit, refuse_unfinished, run_sweeps, sound_start
-from .fit_scan import first_control
+from .checkpoint import Checkpoint
+from .fit import (
+    CHECKPOINT,
+    Sweep,
+    check,
+    fit,
+    gather_inputs,
+    make_solver,
+    record_fit,
+    refuse_unfinished,
+    run_sweeps,
+    sound_start,
+)
+from .fit_scan import CHECKPOINT_START, first_control
 
 _FEWEST = 10  # points of a frame
 _FEW = 0.4  # of the points of most frames
@@ -59,6 +74,8 @@ def fit_series(
     throw: bool = True,
     on_stage: Callable[[str], None] | None = None,
     on_sweep: Callable[[Sweep], None] | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    keep_checkpoint: bool = False,
 ) -> SeriesFit:
     """Fit the frames of a series, such as those of a heart through its beat, by one control mesh.
 
@@ -82,11 +99,14 @@ def fit_series(
         priors: as in `fit`; neither shape nor symmetry.
         throw: raise where the fit did not converge.
         on_stage: told what begins, in a few words.
+        checkpoint: a folder from which a call with the same arguments goes on where it was stopped, see `fit`; what the
+            first frame told is in it too, in `checkpoint_start.npz`.
+        keep_checkpoint: leave both files when the fit has ended, see `fit`.
 
     Raises:
         ScanError: there are fewer than two frames; a frame has too few points, no slices though others have them, or a
             slice in another plane; the text names the frame.
-        ValueError: as `fit_scan`; or the priors ask for shape or symmetry.
+        ValueError: as `fit_scan`; or the priors ask for shape or symmetry; or the checkpoint is of another series.
         RuntimeError: with `throw`, the fit did not converge.
 
     Warns:
@@ -99,26 +119,31 @@ def fit_series(
     if priors.shape is not None or np.isfinite(priors.symmetry):
         raise ValueError("a series is fitted without `Priors.shape` and `Priors.symmetry`: leave them out.")
     valves = find_valves(mesh, valves)
-    say = on_stage or (lambda words: None)
-    scheme, origin = scheme or js.Interpolating(), Origin()
+    say, scheme = on_stage or (lambda words: None), scheme or js.Interpolating()
     match_regions(scans[0], mesh, regions)  # before anything is computed: what cannot be matched is told at once
-    if pose is not None:
-        say("aligns the control mesh with the first frame")
-        alignment = align(mesh, scans[0], kind=pose)
-        mesh, origin = alignment.mesh, Origin(alignment.pose, alignment.doubts)
     told = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
-    bare = js.ControlMesh(mesh.vertices, mesh.faces)
-    say("fits the first frame")
-    topology = js.build_topology(bare, scheme, levels)
-    first = first_control(mesh, scheme)
-    pilot = fit(scheme, topology, first, scans[0], regions=match_regions(scans[0], mesh, regions), throw=False, **told)
-
+    kept = kept_sweeps = before = None
+    if checkpoint is not None:
+        inputs = {"frames": list(scans), "mesh": (mesh.vertices, mesh.faces, mesh.normals, mesh.regions)}
+        inputs |= {"scheme": scheme, "levels": levels, "pose": pose, "regions": regions, "periodic": periodic}
+        inputs |= {"valves": valves, "valve_deviation": valve_deviation} | told
+        kept, kept_sweeps = (Checkpoint(Path(checkpoint) / name, inputs) for name in (CHECKPOINT_START, CHECKPOINT))
+        before = kept.read()
+    if before is not None:
+        say("goes on where it was stopped")
+    first = before or _fit_first(scans[0], mesh, scheme, levels, pose, regions, told, say)
+    if kept is not None and before is None:
+        kept.write(first)
+    origin = Origin.from_json(str(first["origin"]))
+    normals = first.get("template_normals")
+    mesh = js.ControlMesh(first["template"], mesh.faces, normals, check=False, regions=mesh.regions)
     scan, frames = place_frames(scans, periodic)
     n = len(scans)
     say(f"fits {n} frames, {n * len(mesh.vertices):,} control vertices")
     whole = copy_mesh(mesh, frames)
     tables = js.build_topology(js.ControlMesh(whole.vertices, whole.faces), scheme, levels)
-    control = js.Control(jnp.asarray(frames.copy_rows(np.asarray(first.vertices))), jnp.tile(first.normals, (n, 1)))
+    placed = first_control(mesh, scheme)
+    control = js.Control(jnp.asarray(frames.copy_rows(np.asarray(placed.vertices))), jnp.tile(placed.normals, (n, 1)))
     check(scheme, tables, control, scan)
     control = sound_start(scheme, tables, control, free)
     inputs = gather_inputs(scheme, tables, control, scan, free, None, 1.0, None)
@@ -127,21 +152,63 @@ def fit_series(
     inputs["slices"] = find_slice_planes(frames.place_back(scan)) if free.shifts else None
     inputs["valves"], scan = _take_valve_points(scan, mesh, match, valves, valve_deviation, inputs["slices"], n)
     model, y = analyse(scheme, tables, control, free, priors, inputs)
-    y = _start_at(pilot, y, frames)
+    y = _start_at(first, y, frames)
     scene = make_scene(scan, model.refine(y), inputs["slices"], choose_faces(match, model, y, scan))
-    strengths = FromPilot(_targets(pilot, model, n))
+    strengths = FromPilot(_targets(first, model, n))
     solver = make_solver(model, y, scene, None, loss, tolerance, max_sweeps, strengths)
     subject = Subject(model, scene)
     state = solver.init(subject_residual, y, subject, {}, None, None, frozenset())
-    y, state, ended = run_sweeps(solver, subject, y, state, control, on_sweep)
+    if kept_sweeps is not None and (stopped := kept_sweeps.read_tree((y, state))) is not None:
+        y, state = stopped
+    y, state, ended = run_sweeps(solver, subject, y, state, control, on_sweep, kept_sweeps)
     settings = Settings.of(scheme, tables, **told)
     record = record_fit(model, y, state, scene, scan, control, inputs, settings, ended, origin)
     if isinstance(solver.linear_solver, SparseNormal):
         record = dataclasses.replace(record, structure=solver.linear_solver.structure)
     result = FitResult(record)
+    if kept is not None and kept_sweeps is not None and not keep_checkpoint:
+        kept.remove()
+        kept_sweeps.remove()
     if throw:
         refuse_unfinished(result)
     return SeriesFit(result, tuple(names), valves)
+
+
+def _fit_first(
+    scan: Scan,
+    mesh: js.ControlMesh,
+    scheme: js.AbstractScheme,
+    levels: int,
+    pose: Kind | None,
+    regions: Groups | None,
+    told: dict[str, Any],
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    """Align the template with the first frame and fit that alone: arrays for the start of all frames, by name.
+
+    Args:
+        told: what `fit` takes.
+    """
+    origin = Origin()
+    if pose is not None:
+        say("aligns the control mesh with the first frame")
+        alignment = align(mesh, scan, kind=pose)
+        mesh, origin = alignment.mesh, Origin(alignment.pose, alignment.doubts)
+    say("fits the first frame")
+    topology = js.build_topology(js.ControlMesh(mesh.vertices, mesh.faces), scheme, levels)
+    match = match_regions(scan, mesh, regions)
+    pilot = fit(scheme, topology, first_control(mesh, scheme), scan, regions=match, throw=False, **told)
+    found = {
+        "origin": origin.to_json(),
+        "template": mesh.vertices,
+        "template_normals": mesh.normals,
+        "vertices": np.asarray(pilot.control.vertices) - _common_motion(pilot),
+        "normals": pilot.control.normals,
+        "h": pilot.fit.y.shared.get("h"),
+        "determined": pilot.fit.strengths.determined,
+    }
+    strengths = {f"strength {name}": value for name, value in pilot.fit.strengths.values.items()}
+    return {name: np.asarray(value) for name, value in (found | strengths).items() if value is not None}
 
 
 def _take_valve_points(
@@ -180,16 +247,14 @@ def _take_valve_points(
     return given, dataclasses.replace(scan, weights=weights)
 
 
-def _start_at(pilot: FitResult, y: Variables, frames: Frames) -> Variables:
+def _start_at(first: dict[str, Any], y: Variables, frames: Frames) -> Variables:
     """The variables of all frames where those of the first one ended, less the motion that its slices have in common.
 
     That motion is hardly known from the scan, and little by little only would the prior of the shifts take it back.
     """
-    vertices = np.asarray(pilot.control.vertices) - _common_motion(pilot)
-    normals = jnp.tile(pilot.control.normals, (len(frames.counts), 1))
-    own = pilot.fit.y.shared
-    shared = {name: own[name] if name in own and name == "h" else value for name, value in y.shared.items()}
-    return Variables(js.Control(jnp.asarray(frames.copy_rows(vertices)), normals), shared)
+    normals = jnp.tile(jnp.asarray(first["normals"]), (len(frames.counts), 1))
+    shared = {name: jnp.asarray(first["h"]) if name == "h" else value for name, value in y.shared.items()}
+    return Variables(js.Control(jnp.asarray(frames.copy_rows(first["vertices"])), normals), shared)
 
 
 def _common_motion(result: FitResult) -> Float[np.ndarray, "3"]:
@@ -201,11 +266,10 @@ def _common_motion(result: FitResult) -> Float[np.ndarray, "3"]:
     return np.linalg.lstsq(planes, np.asarray(result.fit.y.shared["shifts"], np.float64).ravel(), rcond=1e-3)[0]
 
 
-def _targets(pilot: FitResult, model: Model, n: int) -> FromTargets:
+def _targets(first: dict[str, Any], model: Model, n: int) -> FromTargets:
     """The strengths of one frame's priors for all frames."""
-    found = pilot.fit.strengths
-    topology = pilot.fit.topology
-    n_faces, triangles = topology.n_control_faces, np.asarray(topology.control_faces[3])
+    found = {name.removeprefix("strength "): value for name, value in first.items() if name.startswith("strength ")}
+    triangles = np.asarray(model.topology.control_faces[3])[: len(model.topology.control_faces[3]) // n]
     values = {}
     for prior in model.priors:
         if not prior.n_strengths:
@@ -213,11 +277,11 @@ def _targets(pilot: FitResult, model: Model, n: int) -> FromTargets:
         given = prior.given_strengths()
         if given is not None:
             values[prior.name] = given
-        elif prior.n_strengths == n * n_faces:
-            values[prior.name] = copies_of_faces(found.values[prior.name], triangles, n)
-        elif prior.name in found.values:
-            values[prior.name] = found.values[prior.name]
-    return FromTargets(values, found.values["likeness"], n * found.determined)
+        elif prior.n_strengths == model.topology.n_control_faces:
+            values[prior.name] = copies_of_faces(found[prior.name], triangles, n)
+        elif prior.name in found:
+            values[prior.name] = found[prior.name]
+    return FromTargets(values, found["likeness"], n * first["determined"])
 
 
 def _check_frames(scans: Sequence[Scan], names: Sequence[str]) -> None:

@@ -1,5 +1,6 @@
 """Subjects of different sizes filled up to one size, so that one compiled program fits them all."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -16,7 +17,10 @@ from ..scan.scan import Scan
 
 
 def fill_up(inputs: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Landmarks, boundary points and slices filled up to the most of any subject, so that one program serves all."""
+    """Landmarks, boundary points and slices filled up to the most of any subject, so that one program serves all; the
+    inputs themselves where there is nothing to fill up."""
+    if all(own[name] is None for own in inputs for name in ("landmarks", "boundary", "slices")):
+        return inputs
     filled = [dict(own) for own in inputs]
     for name, fill in (("landmarks", _fill_landmarks), ("boundary", _fill_curve), ("slices", _fill_planes)):
         sizes = [0 if own[name] is None else len(own[name][0]) for own in inputs]
@@ -92,23 +96,38 @@ def fill_choices(choices: list[js.FaceChoice | None], n_points: list[int]) -> li
     return filled
 
 
-def split_common(subjects: list[Any]) -> tuple[Any, Any]:
-    """What all subjects share, once; and what differs, one a row."""
+def split_common(subjects: Sequence[Any]) -> tuple[Any, list[Any]]:
+    """What all subjects share, once, as a pytree; and what differs, as one of each. Each lacks what the other has."""
     flat = [jax.tree.flatten(subject) for subject in subjects]
     structure = flat[0][1]
-    for _, other in flat:
-        if other != structure:
-            raise ValueError(
-                "the subjects of a cohort must have the same priors: give landmarks and so on for all or none."
-            )
-    shared, own = [], []
-    for leaves in zip(*(leaves for leaves, _ in flat), strict=True):
-        first = leaves[0]
-        same = all(leaf is first or np.array_equal(leaf, first) for leaf in leaves)
-        shared.append(first if same else None)
-        own.append(None if same else jnp.stack([jnp.asarray(leaf) for leaf in leaves]))
-    if all(leaf is None for leaf in own):  # one subject, or copies of one
-        y = structure.unflatten(range(len(shared)))[2].control.vertices
-        own[y] = jnp.stack([leaves[0][y] for leaves in flat])
-        shared[y] = None
-    return structure.unflatten(shared), structure.unflatten(own)
+    if any(other != structure for _, other in flat):
+        raise ValueError(
+            "the subjects of a cohort must have the same priors: give landmarks and so on for all or none."
+        )
+    leaves = [leaves for leaves, _ in flat]
+    same = [all(_is_same(one, of_all[0]) for one in of_all) for of_all in zip(*leaves, strict=True)]
+    shared = [leaf if alike else None for leaf, alike in zip(leaves[0], same, strict=True)]
+    own = [[None if alike else leaf for leaf, alike in zip(some, same, strict=True)] for some in leaves]
+    return structure.unflatten(shared), [structure.unflatten(some) for some in own]
+
+
+def share_equal(tree: Any, other: Any) -> Any:
+    """A pytree with the arrays of another where they are equal, so that many subjects hold them once."""
+    leaves, structure = jax.tree.flatten(tree)
+    others, alike = jax.tree.flatten(other)
+    if structure != alike:
+        return tree
+    return structure.unflatten([b if _is_same(a, b) else a for a, b in zip(leaves, others, strict=True)])
+
+
+def stack(trees: Sequence[Any]) -> Any:
+    """The arrays of several pytrees, one a row, on the host."""
+    return jax.tree.map(lambda *rows: np.stack([np.asarray(row) for row in rows]), *trees)
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    if one is other:
+        return True
+    if not all(isinstance(leaf, (np.ndarray, jax.Array)) for leaf in (one, other)):
+        return bool(one == other)
+    return one.dtype == other.dtype and np.array_equal(one, other)

@@ -5,6 +5,10 @@
 `half` fits all skulls, and then the half of each of some, by the family of all others. Errors are distances from the
 points of the half that was left out to the surface. Mirrored: the half that is seen is mirrored about the plane of
 the template where it was aligned, or where the family's member lies, or, as a bound, about that of the whole skull.
+`killed` fits 200 subjects made from a scan that ships, in a process that is killed three times at random moments and
+started again, and in one that is not, and compares the fits bit for bit.
+`scale` fits cohorts of other numbers of points and subjects at once, each in a process of its own: CPU seconds a
+subject once compiled, of all its preparation too; memory of the device as told before; and the most of the process.
 Only points of a skull that are seen from outside count. Lengths in mm. Prints Markdown tables.
 
     pip install -e '.[bench]' && python tests/bench/fit_cohorts.py half --subjects 3 8 14
@@ -14,6 +18,8 @@ The data are not shipped: they are taken from ../shared/data beside the reposito
 
 import argparse
 import json
+import resource
+import subprocess
 import sys
 import time
 import warnings
@@ -183,14 +189,124 @@ def half(data: Path, subjects: Sequence[int], folder: Path) -> None:
         print(f"| {name} | " + " | ".join(f"{value:.3f}" for value in [*values, float(np.mean(values))]) + " |")
 
 
+def make_subjects(n: int) -> tuple[js.ControlMesh, list[fitting.Scan]]:
+    """A template, and scans of different lengths whose anatomy is stretched and bent at random."""
+    scan, mesh = fitting.example("head_fragment")
+    rng, points = np.random.default_rng(0), np.asarray(scan.points, np.float64)
+    middle, size = points.mean(axis=0), np.ptp(points, axis=0).max()
+    scans = []
+    for _ in range(n):
+        some = points[rng.choice(len(points), rng.integers(800, 1600), replace=False)] - middle
+        bent = (
+            some * (1 + rng.normal(scale=0.04, size=3))
+            + rng.normal(scale=0.02, size=3) * some[:, [1, 2, 0]] ** 2 / size
+        )
+        scans.append(fitting.Scan(bent + middle + rng.normal(scale=0.2, size=bent.shape)))
+    return mesh, scans
+
+
+def fit_subjects(folder: Path, n: int) -> None:
+    """One process of `killed`: fits all, goes on where an earlier one was killed, and saves the fits."""
+    mesh, scans = make_subjects(n)
+    scheme = js.Interpolating()
+    topology = js.build_topology(js.ControlMesh(mesh.vertices, mesh.faces), scheme, 1)
+    start = time.perf_counter()
+    found = fitting.fit_cohort(
+        scheme, topology, mesh.control(), scans, checkpoint=folder, on_stage=lambda words: print(words, flush=True)
+    )
+    print(f"all after {time.perf_counter() - start:.0f} s, {found.converged.sum()} converged", flush=True)
+    found.save(folder)
+
+
+def killed(folder: Path, n: int, kills: int) -> None:
+    rng, names = np.random.default_rng(0), ("once", "killed")
+
+    def start(name: str) -> subprocess.Popen:
+        command = [sys.executable, __file__, "fit_subjects", "--family", str(folder / name), "--n", str(n)]
+        return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+
+    def kept(name: str) -> int:
+        return len(list((folder / name).glob("checkpoint_of_cohort_*.npz")))
+
+    print("| run | seconds | ended by | buckets kept before and after |\n|---|--:|---|---|", flush=True)
+    for name, moments in (("once", []), ("killed", [*rng.uniform(0.1, 0.9, kills)])):
+        share = 0.0
+        for run in range(len(moments) + 1):
+            before, began, process = kept(name), time.perf_counter(), start(name)
+            if run < len(moments):  # a part of what was left, counted in buckets: how long one takes is not known
+                share += (1 - share) * moments[run] / 2
+                while kept(name) < share * n and process.poll() is None:
+                    time.sleep(float(rng.uniform(0, 0.1)))
+                process.kill()
+            lines = (process.communicate()[0] or "").splitlines()
+            ended = "SIGKILL" if process.returncode < 0 else lines[-1]
+            counts = f"{before}, {kept(name)}"
+            print(f"| {name} | {time.perf_counter() - began:.0f} | {ended} | {counts} |", flush=True)
+    once, again = (fitting.load_cohort(folder / name) for name in names)
+    for name in ("h", "weights", "rms", "sweeps"):
+        same = np.array_equal(*(np.asarray(getattr(one, name)) for one in (once, again)), equal_nan=True)
+        print(f"{name}: {'identical' if same else 'DIFFERENT'}")
+    same = np.array_equal(once.control.vertices, again.control.vertices)
+    print(f"control vertices: {'identical' if same else 'DIFFERENT'}")
+
+
+def scale() -> None:
+    cases = [(1000, 1), (1000, 8), (4000, 1), (16000, 1)]
+    print("| points | at once | CPU s a subject | CPU s to compile | MB on the device | GB in all |", flush=True)
+    print("|--:|--:|--:|--:|--:|--:|", flush=True)
+    for case in cases:
+        command = [sys.executable, __file__, "scale_case", "--subjects", *map(str, case)]
+        out = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout
+        print(out.splitlines()[-1], flush=True)
+
+
+def scale_case(n_points: int, at_once: int) -> None:
+    scan, mesh = fitting.example("head_fragment")
+    rng, points, n, scheme = np.random.default_rng(0), np.asarray(scan.points, np.float64), 8, js.Interpolating()
+    topology = js.build_topology(js.ControlMesh(mesh.vertices, mesh.faces), scheme, 1)
+    scans = []
+    for _ in range(n):
+        some = points[rng.integers(0, len(points), n_points)] * (1 + rng.normal(scale=0.03, size=3))
+        scans.append(fitting.Scan(some + rng.normal(scale=0.2, size=some.shape)))
+    told, seconds = [], []
+    for _ in range(2):
+        began = time.process_time()
+        fitting.fit_cohort(
+            scheme,
+            topology,
+            mesh.control(),
+            scans,
+            priors=fitting.Priors(bend=0.01, likeness=0.5),
+            at_once=at_once,
+            on_stage=told.append,
+        )
+        seconds.append(time.process_time() - began)
+    memory = next(words for words in told if " MB" in words).split(" in ")[-1].split(" MB")[0]
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9  # KiB on Linux
+    own = seconds[1] / n
+    print(f"| {n_points:,} | {at_once} | {own:.2f} | {seconds[0] - seconds[1]:.0f} | {memory} | {most:.2f} |")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("what", choices=("heart", "first", "half"))
+    parser.add_argument("what", choices=("heart", "first", "half", "killed", "fit_subjects", "scale", "scale_case"))
     parser.add_argument("--data", type=Path, default=DATA, help=f"folder of the scans (default: {DATA})")
     parser.add_argument("--subjects", type=int, nargs="+", default=[3, 8, 14], help="whose half is fitted")
-    parser.add_argument("--n", type=int, default=6, help="skulls of a mean (default: %(default)s)")
-    parser.add_argument("--family", type=Path, default=Path("skull_family"), help="folder that keeps the skulls' fits")
+    parser.add_argument("--n", type=int, help="skulls of a mean, or subjects of `killed` (default: 6, 200)")
+    parser.add_argument("--family", type=Path, default=Path("skull_family"), help="folder that keeps the fits")
     options = parser.parse_args(arguments)
+    if options.what == "killed":
+        killed(options.family, options.n or 200, 3)
+        return 0
+    if options.what == "scale":
+        scale()
+        return 0
+    if options.what == "scale_case":
+        scale_case(*options.subjects)
+        return 0
+    if options.what == "fit_subjects":
+        fit_subjects(options.family, options.n)
+        return 0
     if not (options.data / "skulls").is_dir():
         print(
             f"error: {options.data / 'skulls'} is not there. The data are not shipped: name their folder with --data."
@@ -199,7 +315,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.what == "heart":
         heart(options.data)
     elif options.what == "first":
-        first_subjects(options.data, options.n)
+        first_subjects(options.data, options.n or 6)
     else:
         half(options.data, options.subjects, options.family)
     return 0
