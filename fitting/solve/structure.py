@@ -1,12 +1,12 @@
 """What the analysis of a model finds: which unknowns its rows depend on, and where their products stand in a matrix."""
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 import jaxsubdiv as js
 
@@ -19,6 +19,7 @@ from .cholesky import analyse as analyse_pattern
 from .elements import Elements, Patches, colour, differentiate, find_elements, find_patches, forgets_some
 
 _MOST_RINGS = 3
+_NOWHERE = np.zeros(0, int), np.zeros(0, int), (np.zeros(0, int), np.zeros(0, int))  # not laid out yet
 
 
 class Tied(NamedTuple):
@@ -40,6 +41,8 @@ class Structure:
     elements: Elements
     patches: Patches
     tied: list[Tied]
+    fixed: Bool[np.ndarray, "o"]
+    """Which unknowns of vertices may not move."""
     pattern: sp.csc_array
     """Of A."""
     near: sp.csc_array | None
@@ -78,6 +81,16 @@ class Structure:
         faces = np.zeros(n, np.int64)
         faces[self.corners] = self.patches.owner[:, None]
         return faces
+
+    def including(self, more: sp.sparray) -> "Structure":
+        """The structure with the entries of another matrix of all unknowns, which rows of one sweep alone couple."""
+        n = self.n
+        own = sp.coo_array(sp.csc_array(more)[:n, :n])
+        if np.isin(own.col.astype(np.int64) * n + own.row, _keys(self.pattern)).all():
+            return self
+        entries = sp.csc_array((np.ones(own.nnz), (own.row, own.col)), shape=(n, n))
+        near = None if self.near is None else _sorted(self.near + entries)
+        return _lay_out(replace(self, pattern=_sorted(self.pattern + entries), near=near))
 
     def arrange(self, values: Float[np.ndarray, "_"], n_shared: int) -> Arrowhead:
         """The arrowhead of values in the pattern of the elements, in which h stands after the unknowns of vertices."""
@@ -119,7 +132,7 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> Structur
     rows = row_faces(model, held)
     for rings in range(1, _MOST_RINGS + 1):
         elements = find_elements(model, rings)
-        found = differentiate(model, y, held, elements.seeds)
+        found = differentiate(model, y, held_of_faces(model, held), elements.seeds)
         if not forgets_some(elements, patches, found, rows):
             break
     else:
@@ -137,23 +150,27 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> Structur
             near = _sorted(pattern)
         by = sparse_rows(np.ones(one.columns.shape), one.columns, layout.n)
         pattern = pattern + abs(sp.csc_array((by.T @ by)[:n, :n]))
-    pattern = _sorted(pattern)
+    fixed = np.asarray(model.is_free)[:n] == 0
+    return _lay_out(Structure(layout, elements, patches, tied, fixed, _sorted(pattern), near, *_NOWHERE))
+
+
+def _lay_out(structure: Structure) -> Structure:
+    """Find where the entries of the pattern stand."""
+    pattern, of_elements, fixed, n = structure.pattern, structure.elements.pattern, structure.fixed, structure.n
     keys, column = _keys(pattern), _columns(pattern)
-    of_elements = elements.pattern
     source = np.flatnonzero((of_elements.indices < n) & (_columns(of_elements) < n))
     place = np.searchsorted(keys, _columns(of_elements)[source].astype(np.int64) * n + of_elements.indices[source])
-    fixed = np.asarray(model.is_free)[:n] == 0
-    return Structure(
-        layout,
-        elements,
-        patches,
-        tied,
-        pattern,
-        near,
-        np.flatnonzero(pattern.indices == column),
-        np.flatnonzero(fixed[pattern.indices] | fixed[column]),
-        (source, place),
+    return replace(
+        structure,
+        diagonal=np.flatnonzero(pattern.indices == column),
+        fixed_entries=np.flatnonzero(fixed[pattern.indices] | fixed[column]),
+        from_elements=(source, place),
     )
+
+
+def held_of_faces(model: Model, held: dict[str, Any]) -> dict[str, Any]:
+    """What the face priors hold."""
+    return {prior.name: held[prior.name] for prior in model.face_priors}
 
 
 def row_faces(model: Model, held: dict[str, Any]) -> Int[np.ndarray, "m"]:
