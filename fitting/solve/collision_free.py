@@ -17,7 +17,7 @@ from ..model.unknowns import Layout, Variables
 from ..start.folds import Folds
 from .elements import face_corners
 
-_SOLVED_AGAIN, _MOST_TRIES = 2, 14  # of a step, before none is taken
+_HELD_FASTER, _MOST_TRIES = 2, 16  # of a step, before none is taken
 _LEAST_SHARE, _GRADE = 0.2, 0.25  # of a step that is left: less is nothing; from vertex to vertex it grows by this
 _RINGS = 2  # of control faces around those that crossed in the last try
 _COMMON = 90  # percentile of the heights of triangles: larger ones have the reach of these
@@ -62,6 +62,7 @@ class CrossingGuard:
             owner: the control face of every face of the surface.
         """
         self.reach, self._folds = reach, Folds(model.topology)
+        self._no_quads = jnp.zeros((0, 4), jnp.int32)
         self._triangles = np.asarray(surface.triangles())
         n_triangles = len(surface.faces[3])
         self._owner = np.concatenate([owner[:n_triangles], np.repeat(owner[n_triangles:], 2)])
@@ -84,9 +85,9 @@ class CrossingGuard:
         found = np.zeros(len(self._folds.corners), bool)
         if among is not None:
             rows = np.flatnonzero(among[self._owner])
-            part = js.RefinedSurface(
-                surface.vertices, surface.normals, {3: jnp.asarray(self._triangles[rows]), 4: jnp.zeros((0, 4), int)}
-            )
+            some = np.zeros((1 << len(rows).bit_length(), 3), np.int32)  # few sizes, which jax compiles once each
+            some[: len(rows)] = self._triangles[rows]
+            part = js.RefinedSurface(surface.vertices, surface.normals, {3: jnp.asarray(some), 4: self._no_quads})
             found[self._owner[rows[js.find_crossings(part).triangles]]] = True
         elif _ipctk().has_intersections(self._mesh, _positions(surface)):
             found[self._owner[js.find_crossings(surface).triangles]] = True
@@ -105,7 +106,7 @@ class CrossingGuard:
         Args:
             before: control faces that cross already; they and those beside them are left alone.
             refine: makes the surface after a step.
-            solve_again: the step with some control vertices held faster, from call to call.
+            solve_again: the step without h, and with some control vertices held faster, from call to call.
         """
         left_alone, near = self._around(before), None
         crossed, share, whole = np.zeros(layout.n_vertices, bool), np.ones(layout.n_vertices), 1.0
@@ -123,14 +124,19 @@ class CrossingGuard:
             for _ in range(_RINGS):
                 near = self._around(near)
             corners = self._folds.corners_of(crossing)
+            if k == 0:  # what all share, as h, may be at fault alone
+                step = solve_again(np.zeros_like(corners))
+                continue
             crossed |= corners
-            if k < _SOLVED_AGAIN:
+            if k <= _HELD_FASTER:
                 step = solve_again(corners)
                 continue
-            still = self._folds.corners_of(self._around(crossing)) if (share[corners] == 0).all() else corners
-            if (share[still] == 0).all():
-                whole *= 0.5
-            share[still] = np.where(share[still] > _LEAST_SHARE, 0.5 * share[still], 0.0)
+            if (share[corners] == 0).all():  # the faces move with the vertices around
+                corners = self._folds.corners_of(self._around(crossing))
+                if (share[corners] == 0).all():
+                    whole *= 0.5
+                share[corners] = 0.0
+            share[corners] = np.where(share[corners] > _LEAST_SHARE, 0.5 * share[corners], 0.0)
             self._grade(share)
         return Shortened(np.zeros_like(step), 0.0, crossed)
 
@@ -181,7 +187,9 @@ class CrossingGuard:
         np.minimum.at(found, self._faces, (areas / np.maximum(longest, np.finfo(float).tiny))[:, None])
         return np.where(np.isfinite(found), found, 0.0)
 
-    def _places(self, x: Float[np.ndarray, "v 3"], near: Any) -> tuple[Int[np.ndarray, "c 4"], Float[np.ndarray, "c 4"]]:
+    def _places(
+        self, x: Float[np.ndarray, "v 3"], near: Any
+    ) -> tuple[Int[np.ndarray, "c 4"], Float[np.ndarray, "c 4"]]:
         """The vertices of pairs of places, and their weights: of vertices, edges and triangles that lie near."""
         ends, corners, weights = self._edges, [np.zeros((0, 4), int)], [np.zeros((0, 4))]
 
@@ -240,7 +248,7 @@ def _positions(surface: js.RefinedSurface) -> Float[np.ndarray, "v 3"]:
 
 
 def make_guard(model: Model, y: Variables) -> CrossingGuard | None:
-    """What keeps a fit's surface from passing through itself; None where that was not asked for, or ipctk is missing."""
+    """What keeps a fit's surface from passing through itself; None where nothing is to, or ipctk is not installed."""
     prior = model.prior("contact")
     if not isinstance(prior, ContactPrior) or not can_find_crossings():
         return None

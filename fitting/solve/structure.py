@@ -19,7 +19,6 @@ from .cholesky import analyse as analyse_pattern
 from .elements import Elements, Patches, colour, differentiate, find_elements, find_patches, forgets_some
 
 _MOST_RINGS = 3
-_NOWHERE = np.zeros(0, int), np.zeros(0, int), (np.zeros(0, int), np.zeros(0, int))  # not laid out yet
 
 
 class Tied(NamedTuple):
@@ -47,17 +46,31 @@ class Structure:
     """Of A."""
     near: sp.csc_array | None
     """Without the rows of priors that couple vertices far from each other; None where there are none."""
-    diagonal: Int[np.ndarray, "o"]
-    """Where in A's values its diagonal stands."""
-    fixed_entries: Int[np.ndarray, "_"]
-    """Where the rows and columns of fixed unknowns stand."""
-    from_elements: tuple[Int[np.ndarray, "_"], Int[np.ndarray, "_"]]
-    """Entries of the elements' pattern that belong to A, and where they stand there."""
 
     @property
     def n(self) -> int:
         """Number of unknowns of A."""
         return self.layout.n_own
+
+    @functools.cached_property
+    def diagonal(self) -> Int[np.ndarray, "o"]:
+        """Where in A's values its diagonal stands."""
+        return np.flatnonzero(self.pattern.indices == _columns(self.pattern))
+
+    @functools.cached_property
+    def fixed_entries(self) -> Int[np.ndarray, "_"]:
+        """Where the rows and columns of fixed unknowns stand."""
+        return np.flatnonzero(self.fixed[self.pattern.indices] | self.fixed[_columns(self.pattern)])
+
+    @functools.cached_property
+    def from_elements(self) -> tuple[Int[np.ndarray, "_"], Int[np.ndarray, "_"]]:
+        """Entries of the elements' pattern that belong to A, and where they stand there."""
+        of_elements, n = self.elements.pattern, self.n
+        column = _columns(of_elements)
+        source = np.flatnonzero((of_elements.indices < n) & (column < n))
+        return source, np.searchsorted(
+            _keys(self.pattern), column[source].astype(np.int64) * n + of_elements.indices[source]
+        )
 
     @functools.cached_property
     def symbolic(self) -> Symbolic:
@@ -90,7 +103,7 @@ class Structure:
             return self
         entries = sp.csc_array((np.ones(own.nnz), (own.row, own.col)), shape=(n, n))
         near = None if self.near is None else _sorted(self.near + entries)
-        return _lay_out(replace(self, pattern=_sorted(self.pattern + entries), near=near))
+        return replace(self, pattern=_sorted(self.pattern + entries), near=near)
 
     def arrange(self, values: Float[np.ndarray, "_"], n_shared: int) -> Arrowhead:
         """The arrowhead of values in the pattern of the elements, in which h stands after the unknowns of vertices."""
@@ -151,21 +164,7 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> Structur
         by = sparse_rows(np.ones(one.columns.shape), one.columns, layout.n)
         pattern = pattern + abs(sp.csc_array((by.T @ by)[:n, :n]))
     fixed = np.asarray(model.is_free)[:n] == 0
-    return _lay_out(Structure(layout, elements, patches, tied, fixed, _sorted(pattern), near, *_NOWHERE))
-
-
-def _lay_out(structure: Structure) -> Structure:
-    """Find where the entries of the pattern stand."""
-    pattern, of_elements, fixed, n = structure.pattern, structure.elements.pattern, structure.fixed, structure.n
-    keys, column = _keys(pattern), _columns(pattern)
-    source = np.flatnonzero((of_elements.indices < n) & (_columns(of_elements) < n))
-    place = np.searchsorted(keys, _columns(of_elements)[source].astype(np.int64) * n + of_elements.indices[source])
-    return replace(
-        structure,
-        diagonal=np.flatnonzero(pattern.indices == column),
-        fixed_entries=np.flatnonzero(fixed[pattern.indices] | fixed[column]),
-        from_elements=(source, place),
-    )
+    return Structure(layout, elements, patches, tied, fixed, _sorted(pattern), near)
 
 
 def held_of_faces(model: Model, held: dict[str, Any]) -> dict[str, Any]:

@@ -272,7 +272,7 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
             def solve_again(crossing: AnyArray) -> AnyArray:
                 nonlocal hold
                 hold = hold_faster(hold, crossing)
-                return rows.step(hold, active)
+                return rows.step(hold, active & ~_columns_of_h(model))
 
             step, whole, crossed = self.guard.shorten(
                 step, crossing, model.layout, lambda step: refine(step)[1], solve_again
@@ -314,6 +314,11 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
         moved = before + step[: layout.n_own].reshape(layout.n_vertices, layout.width)[:, :3]
         turned = self.folds.turned_over(moved, xp) & ~self.folds.turned_over(before, xp)
         return self.folds.corners_of(turned, xp)
+
+
+def _columns_of_h(model: Model) -> Bool[np.ndarray, "k"]:
+    """Which shared unknowns are tangent lengths."""
+    return np.repeat([name == "h" for name, _ in model.layout.shared], [int(np.prod(of.shape, dtype=int)) for _, of in model.layout.shared]).astype(bool)
 
 
 def _next_try(carry: tuple, attempt: Callable, hold_faster: Callable) -> tuple:
