@@ -48,7 +48,7 @@ def pulled(contact: float) -> fitting.FitResult:
 def test_a_surface_that_is_pulled_through_itself_stops_before():
     free, guarded = pulled(0.0), pulled(0.25)
     assert free.fit.model.prior("contact") is None and guarded.fit.model.prior("contact") is not None
-    assert n_crossing(free) > 10 and n_crossing(guarded) == 0
+    assert n_crossing(free) > 5 and n_crossing(guarded) == 0
     finding = next(one for one in free.warnings if one.name == "surface_crosses_itself")
     assert finding.numbers["triangles"] == n_crossing(free) and finding.numbers["at_start"] == 0
     assert finding.text.endswith("The surface did not where the fit started.")
@@ -67,8 +67,8 @@ def test_where_nothing_is_near_a_fit_is_the_same_bit_for_bit():
 
 
 def test_the_report_names_what_crosses_where_the_fit_starts():
-    start, (top, below) = problem().start, top_and_below()
-    found = problem().fit(control=js.Control(start.vertices.at[top].set(below), start.normals), max_sweeps=0)
+    crossed = pulled(0.0)
+    found = problem().fit(scheme=crossed.scheme, control=crossed.control, max_sweeps=0)
     triangles = js.find_crossings(found.surface).triangles
     finding = next(one for one in found.warnings if one.name == "surface_crosses_itself")
     assert finding.numbers["at_start"] == len(triangles) > 0
@@ -103,6 +103,8 @@ def flat():
     assert guard is not None
     scene = make_scene(fitting.Scan(p.points * np.asarray(FLAT)), surface)
     look = measure_look(model, y, surface, scene, fitting.geman_mcclure(), first_strengths(model).values)
+    guard.reach = 2.0  # the triangles of the rim are no higher than the mesh
+    look = look._replace(distances=np.full(len(look.distances), 9.0), weights=np.ones(len(look.weights)))
     return model, y, guard, surface, look, np.zeros(model.topology.n_control_faces, bool)
 
 
@@ -123,12 +125,12 @@ def test_contacts_are_places_that_lie_near_each_other():
 
 def test_the_reach_gives_way_to_layers_of_the_scan():
     *_, guard, surface, look, none = flat()
-    weights = np.ones(len(look.distances))
-    reach = [
-        guard.find_contacts(surface, look._replace(distances=far * weights, weights=weights), none).reach
-        for far in (9.0, -0.1)  # mm: the scan's layers lie outside of the surface, or inside
-    ]
-    assert reach[1].max() < 0.5 * reach[0].max()
+    usual = guard.find_contacts(surface, look, none)  # the scan's layers lie far outside of the surface
+    near = guard.find_contacts(surface, look._replace(distances=np.full(len(look.distances), 0.4)), none)
+    assert len(near.reach) < len(usual.reach) and near.reach.max() < usual.reach.max()
+    # Top and bottom are 0.6 mm apart, the layers of the scan 0.4 mm farther out on both sides: half of 1.4 mm.
+    between = np.isclose(near.gap, 0.6, atol=0.05)
+    assert between.any() and near.reach[between].max() < 0.75
 
 
 def test_equations_know_the_derivatives_of_contacts_and_couple_both_sides():
@@ -176,12 +178,12 @@ def test_a_step_is_shortened_where_it_crosses_and_elsewhere_taken():
 
     none = np.zeros(model.topology.n_control_faces, bool)
     assert guard.crossing_faces(refine(step)).any()
-    found = guard.shorten(step, none, model.layout, refine, solve_again)
-    assert not guard.crossing_faces(refine(found.step)).any()
-    assert asked[0][top] and found.crossed[top]
-    taken = found.step[: model.layout.n_own].reshape(-1, model.layout.width)
+    found, whole = guard.shorten(step, none, model.layout, refine, solve_again)
+    assert not guard.crossing_faces(refine(found)).any()
+    assert not asked[0].any() and asked[1][top] and whole > 0
+    taken = found[: model.layout.n_own].reshape(-1, model.layout.width)
     assert 0 < np.linalg.norm(taken[top]) < np.linalg.norm(table[top])
     # Where nothing helps, no step is taken; where that crossed before, all of it.
     crossed = refine(step)
-    assert not guard.shorten(step, none, model.layout, lambda _: crossed, solve_again).step.any()
-    np.testing.assert_array_equal(guard.shorten(step, ~none, model.layout, refine, solve_again).step, step)
+    assert not guard.shorten(step, none, model.layout, lambda _: crossed, solve_again)[0].any()
+    np.testing.assert_array_equal(guard.shorten(step, ~none, model.layout, refine, solve_again)[0], step)

@@ -2,7 +2,7 @@
 
 import importlib
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -36,16 +36,6 @@ def _ipctk() -> Any:
         return importlib.import_module("ipctk")
     except ImportError:
         return None
-
-
-class Shortened(NamedTuple):
-    """A step that makes nothing cross."""
-
-    step: Float[np.ndarray, "n"]
-    whole: float
-    """What share of it is left as a whole: 1, but where shortening it in places was not enough."""
-    crossed: Bool[np.ndarray, "v"]
-    """Control vertices of faces that would have crossed."""
 
 
 class CrossingGuard:
@@ -100,16 +90,22 @@ class CrossingGuard:
         layout: Layout,
         refine: Callable[[Float[np.ndarray, "n"]], js.RefinedSurface],
         solve_again: Callable[[Bool[np.ndarray, "v"]], Float[np.ndarray, "n"]],
-    ) -> Shortened:
+    ) -> tuple[Float[np.ndarray, "n"], float]:
         """Shorten a step until nothing crosses that did not before: first where something would, then as a whole.
+
+        The step is solved again without h, which moves all of the surface, and then with the vertices of the faces that
+        would cross held faster; only after that is it cut. When tries run out there is no step, which crosses nothing.
 
         Args:
             before: control faces that cross already; they and those beside them are left alone.
             refine: makes the surface after a step.
             solve_again: the step without h, and with some control vertices held faster, from call to call.
+
+        Returns:
+            The step, and what share of it is left where nothing would cross: 1, but where all of it had to be cut.
         """
         left_alone, near = self._around(before), None
-        crossed, share, whole = np.zeros(layout.n_vertices, bool), np.ones(layout.n_vertices), 1.0
+        share, whole = np.ones(layout.n_vertices), 1.0
         for k in range(_MOST_TRIES):
             own = layout.of_vertices(share)
             taken = whole * step * np.concatenate([own, np.ones(layout.n - layout.n_own)])
@@ -119,7 +115,7 @@ class CrossingGuard:
             if not crossing.any():
                 crossing = self.crossing_faces(surface) & ~left_alone
             if not crossing.any():
-                return Shortened(taken, whole, crossed)
+                return taken, whole
             near = crossing
             for _ in range(_RINGS):
                 near = self._around(near)
@@ -127,7 +123,6 @@ class CrossingGuard:
             if k == 0:  # what all share, as h, may be at fault alone
                 step = solve_again(np.zeros_like(corners))
                 continue
-            crossed |= corners
             if k <= _HELD_FASTER:
                 step = solve_again(corners)
                 continue
@@ -138,7 +133,7 @@ class CrossingGuard:
                 share[corners] = 0.0
             share[corners] = np.where(share[corners] > _LEAST_SHARE, 0.5 * share[corners], 0.0)
             self._grade(share)
-        return Shortened(np.zeros_like(step), 0.0, crossed)
+        return np.zeros_like(step), 0.0
 
     def _around(self, faces: Bool[np.ndarray, "f"]) -> Bool[np.ndarray, "f"]:
         """These control faces and those that have a vertex in common with them."""
@@ -176,7 +171,8 @@ class CrossingGuard:
         away = _offsets(look, len(x))[:, None] * np.asarray(surface.normals, np.float64)
         of_scan = gap + np.einsum("ci,cx,cix->c", weights, directions, away[corners])
         reach = np.clip(0.5 * of_scan, _LEAST_REACH * reach, reach)
-        return Contacts(corners.astype(np.int32), weights, directions, reach, np.maximum(gap, _LEAST_GAP * reach))
+        found = Contacts(corners.astype(np.int32), weights, directions, reach, np.maximum(gap, _LEAST_GAP * reach))
+        return Contacts(*(part[gap < reach] for part in found))
 
     def _heights(self, x: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v"]:
         """The least height of the triangles at each vertex."""

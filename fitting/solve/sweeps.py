@@ -274,10 +274,7 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
                 hold = hold_faster(hold, crossing)
                 return rows.step(hold, active & ~_columns_of_h(model))
 
-            step, whole, crossed = self.guard.shorten(
-                step, crossing, model.layout, lambda step: refine(step)[1], solve_again
-            )
-            damping = Damping(hold_faster(damping.hold, crossed), damping.step)
+            step, whole = self.guard.shorten(step, crossing, model.layout, lambda step: refine(step)[1], solve_again)
         new_strengths = strengths
         if isinstance(self.strengths, FromScan):
             solve = rows.solver("all", loose, active)  # what damps a step says nothing of what the scan determines
@@ -318,7 +315,8 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
 
 def _columns_of_h(model: Model) -> Bool[np.ndarray, "k"]:
     """Which shared unknowns are tangent lengths."""
-    return np.repeat([name == "h" for name, _ in model.layout.shared], [int(np.prod(of.shape, dtype=int)) for _, of in model.layout.shared]).astype(bool)
+    parts = [np.full(int(np.prod(of.shape, dtype=int)), name == "h") for name, of in model.layout.shared]
+    return np.concatenate([np.zeros(0, bool), *parts])
 
 
 def _next_try(carry: tuple, attempt: Callable, hold_faster: Callable) -> tuple:
