@@ -72,14 +72,16 @@ class CrossingGuard:
         Args:
             among: control faces of which to look at; default: all.
         """
-        found = np.zeros(len(self._folds.corners), bool)
+        found, x = np.zeros(len(self._folds.corners), bool), _positions(surface)
+        if not np.isfinite(x).all():
+            return found  # the fit ends of it
         if among is not None:
             rows = np.flatnonzero(among[self._owner])
             some = np.zeros((1 << len(rows).bit_length(), 3), np.int32)  # few sizes, which jax compiles once each
             some[: len(rows)] = self._triangles[rows]
             part = js.RefinedSurface(surface.vertices, surface.normals, {3: jnp.asarray(some), 4: self._no_quads})
             found[self._owner[rows[js.find_crossings(part).triangles]]] = True
-        elif _ipctk().has_intersections(self._mesh, _positions(surface)):
+        elif _ipctk().has_intersections(self._mesh, x):
             found[self._owner[js.find_crossings(surface).triangles]] = True
         return found
 

@@ -67,7 +67,7 @@ class SparseEquations:
         self.found = differentiate(bare, y, held_of_faces(model, held.priors), structure.elements.seeds)
         self._by: dict[str, Float[np.ndarray, "m d"]] = {}
         self._jacobians: dict[str, sp.csr_array] = {}
-        self._known: dict[tuple[str, bytes], ArrowheadFactor] = {}
+        self._known: dict[tuple[str, bytes, bytes], ArrowheadFactor] = {}
         of_surface = [self._add_surface_prior(structure, prior) for prior in model.surface_priors]
         for matrix in of_surface:
             structure = structure.including(matrix)
@@ -104,10 +104,11 @@ class SparseEquations:
         """Solves with the damped normal matrix of "all" rows, or of those of the "prior"s alone: exactly, or where
         priors couple vertices far from each other by conjugate gradients, the near part of the matrix going before."""
         matrix = self.prior if which == "prior" else self.data.plus(self.prior)
-        factor = self._known.get((which, damping.tobytes()))
+        key = which, damping.tobytes(), b"" if active is None else active.tobytes()
+        factor = self._known.get(key)
         is_near = self.structure.near is not None
         if factor is None:
-            factor = self._known[which, damping.tobytes()] = self.factorise(matrix, damping, active, near=is_near)
+            factor = self._known[key] = self.factorise(matrix, damping, active, near=is_near)
         free = self._free(active)[:, None]
         if not is_near:
             return lambda sides: free * factor.solve(free * sides)

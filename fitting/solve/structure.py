@@ -155,7 +155,8 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> Structur
         )
     layout, n = model.layout, model.layout.n_own
     tied = [_tie(model, prior) for prior in model.vertex_priors]
-    pattern = sp.csc_array(abs(sp.csc_array(elements.pattern.astype(float))[:n, :n])) + sp.eye_array(n, format="csc")
+    own = sp.csc_array(abs(sp.csc_array(elements.pattern.astype(float))[:n, :n]))
+    pattern = sp.csc_array(own + sp.eye_array(n, format="csc"))
     pattern.data[:] = 1
     near = None
     for one in sorted(tied, key=lambda one: one.is_distant):

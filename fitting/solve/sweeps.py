@@ -274,7 +274,9 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
                 hold = hold_faster(hold, crossing)
                 return rows.step(hold, active & ~_columns_of_h(model))
 
-            step, whole = self.guard.shorten(step, crossing, model.layout, lambda step: refine(step)[1], solve_again)
+            step, whole = self.guard.shorten(
+                np.asarray(step), crossing, model.layout, lambda step: refine(step)[1], solve_again
+            )
         new_strengths = strengths
         if isinstance(self.strengths, FromScan):
             solve = rows.solver("all", loose, active)  # what damps a step says nothing of what the scan determines
