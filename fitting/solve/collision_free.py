@@ -95,13 +95,13 @@ class CrossingGuard:
     ) -> tuple[Float[np.ndarray, "n"], float]:
         """Shorten a step until nothing crosses that did not before: first where something would, then as a whole.
 
-        The step is solved again without h, which moves all of the surface, and then with the vertices of the faces that
-        would cross held faster; only after that is it cut. When tries run out there is no step, which crosses nothing.
+        First h stays, then the step is solved again with the vertices of the faces that would cross held faster, and only
+        after that is it cut. When tries run out there is no step, which crosses nothing.
 
         Args:
             before: control faces that cross already; they and those beside them are left alone.
             refine: makes the surface after a step.
-            solve_again: the step without h, and with some control vertices held faster, from call to call.
+            solve_again: the step without h and with some control vertices held faster, from call to call.
 
         Returns:
             The step, and what share of it is left where nothing would cross: 1, but where all of it had to be cut.
@@ -122,8 +122,9 @@ class CrossingGuard:
             for _ in range(_RINGS):
                 near = self._around(near)
             corners = self._folds.corners_of(crossing)
-            if k == 0:  # what all share, as h, may be at fault alone
-                step = solve_again(np.zeros_like(corners))
+            if k == 0 and "h" in dict(layout.shared):  # which moves all of the surface, and may be at fault alone
+                step = step.copy()
+                step[layout.columns("h")] = 0.0
                 continue
             if k <= _HELD_FASTER:
                 step = solve_again(corners)
