@@ -95,8 +95,8 @@ class CrossingGuard:
     ) -> tuple[Float[np.ndarray, "n"], float]:
         """Shorten a step until nothing crosses that did not before: first where something would, then as a whole.
 
-        First h stays, then the step is solved again with the vertices of the faces that would cross held faster, and only
-        after that is it cut. When tries run out there is no step, which crosses nothing.
+        First h stays, then the step is solved again with the vertices of the faces that would cross held faster. Only
+        after that is the step cut. When tries run out there is no step, which crosses nothing.
 
         Args:
             before: control faces that cross already; they and those beside them are left alone.
