@@ -76,7 +76,7 @@ def test_a_report_counts_them():
     scan, mesh = fitting.example("femur_distal")
     topology = js.build_topology(mesh, js.Interpolating(), 1)
     result = fitting.fit(js.Interpolating(), topology, mesh.control(), scan, max_sweeps=1, throw=False)
-    assert result.report().crossing_triangles is None
+    assert result.report().crossing_triangles == 0
     report = result.report(uncertainty=True)
     assert report.crossing_triangles == 0 and report.crossings_at is None
     assert ("triangles that cross others", "0") in report.as_rows()

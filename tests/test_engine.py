@@ -29,6 +29,7 @@ from fitting import (
 from fitting.model.pairing import make_scene
 from fitting.model.priors import REGISTER
 from fitting.model.priors.boundary import BoundaryCurve
+from fitting.model.priors.contact import Contacts
 from fitting.model.priors.landmarks import anchor_landmarks
 from fitting.model.priors.shifts import SlicePlanes
 from fitting.model.priors.valves import ValvePoints
@@ -305,10 +306,14 @@ def derivatives() -> tuple[dict, dict, dict, dict]:
     inputs |= {"regions": RegionMatch(regions, ()), "layers": regions.names}
     upper, lower = (np.isin(np.arange(12), rows) for rows in ((0, 1, 2), (3, 4, 5)))
     slices = np.array([0, 1, -1])
+    inputs["no_crossing"] = True
     inputs["valves"] = ValvePoints(rng.normal(size=(3, 3)), slices, np.zeros(3, int), upper[None], lower)
     model, y = analysed(scheme, topology, control, priors=Priors(shape=family, symmetry=1.0), **inputs)
     assert [prior.name for prior in model.priors] == [kind.name for kind in REGISTER]
     held = model.hold(model.place(y, model.refine(y)), first_strengths(model).values | {"likeness": jnp.asarray(0.5)})
+    weights = np.array([[-1, 0.3, 0.3, 0.4], [-0.5, -0.5, 0.2, 0.8]])
+    corners, away = np.array([[0, 3, 4, 7], [1, 2, 8, 9]]), unit(rng.normal(size=(2, 3)))
+    held["contact"] = Contacts(corners, weights, away, np.full(2, 1e3), np.array([0.5, 2.0]))
     place = jnp.asarray(0.1 * rng.normal(size=model.layout.n))
 
     def rows(vector):

@@ -160,7 +160,7 @@ def test_own_noise_is_that_of_points_about_their_planes():
 
 
 def test_every_check_is_told_once():
-    assert len({check.__name__ for check in CHECKS}) == len(CHECKS) == 8
+    assert len({check.__name__ for check in CHECKS}) == len(CHECKS) == 9
 
 
 # ------------------------------------------------------------------------------------------------ how the fit began

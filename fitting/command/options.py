@@ -80,6 +80,11 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="SHARE",
         help="of the template's own shape, expected of the fit; default: found. 0 where it was made from this scan",
     )
+    add(
+        "--may-cross",
+        action="store_true",
+        help="let the surface pass through itself; default: it does not where the extra `contact` is installed",
+    )
     add("--boundary", metavar="FILE", help="points of the curve that the open surface ends at; `scan`: the scan's rim")
     add("--tolerance", type=float, metavar="MM", help="split the control mesh until the surface is this near the scan")
     add("--points", type=int, metavar="N", help="fit no more than so many, drawn at random; all of them are measured")
@@ -205,6 +210,8 @@ def make_recipe(options: argparse.Namespace) -> Recipe:
     if options.mirror:
         given["mirror"] = True
     asked = {name: getattr(options, name) for name in ("symmetry", "likeness") if getattr(options, name) is not None}
+    if options.may_cross:
+        asked["contact"] = 0.0
     if options.prior is not None:
         asked["shape"] = load_cohort(options.prior)
     if asked:

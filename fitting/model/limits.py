@@ -53,6 +53,7 @@ _LIMITS = {
     "frame_change": _DEVIATION,
     "thickness": _DEVIATION,
     "likeness": _Limit("the likeness is a share, from 0 to 1", 0, 1),
+    "contact": _Limit("the reach of contacts is a part of a triangle's height, from 0, for none, to 0.5", 0, 0.5),
     "c": _Limit("the width of a loss is in units of the noise, from 1e-6 to 1e6", 1e-6, 1e6),
     "alpha": _Limit("the shape of a loss is 2 or less", -np.inf, 2),
     "h": _Limit("a tangent length coefficient is a number from 0 to 100", 0, 100),

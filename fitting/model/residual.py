@@ -11,7 +11,16 @@ from jaxtyping import Array, Float, Int
 import jaxsubdiv as js
 from jaxsubdiv.linalg import dot
 
-from .priors import REGISTER, AbstractFacePrior, AbstractPrior, AbstractVertexPrior, Place, Priors, Start
+from .priors import (
+    REGISTER,
+    AbstractFacePrior,
+    AbstractPrior,
+    AbstractSurfacePrior,
+    AbstractVertexPrior,
+    Place,
+    Priors,
+    Start,
+)
 from .priors.shifts import ShiftPrior
 from .unknowns import Free, Layout, Unknowns, Variables
 
@@ -66,6 +75,11 @@ class Model(eqx.Module):
     def vertex_priors(self) -> list[AbstractVertexPrior]:
         """Priors whose rows tie control vertices anywhere."""
         return [prior for prior in self.priors if isinstance(prior, AbstractVertexPrior)]
+
+    @property
+    def surface_priors(self) -> list[AbstractSurfacePrior]:
+        """Priors whose rows tie vertices of the surface anywhere."""
+        return [prior for prior in self.priors if isinstance(prior, AbstractSurfacePrior)]
 
     def scheme_at(self, y: Variables) -> js.AbstractScheme:
         """The scheme with its h."""

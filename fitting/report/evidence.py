@@ -117,6 +117,8 @@ class Evidence(NamedTuple):
     """Of the surface's vertices, in mm^2."""
     covered: Bool[np.ndarray, "v"]
     """Vertices that the scan covers."""
+    crossings: js.Crossings | None
+    """Where the surface goes through itself; None where that was not looked for."""
 
 
 def rests_far_off(scene: Scene, noise: float, edge: float, robust_rms: Float[np.ndarray, "sweeps"]) -> bool:
@@ -140,7 +142,11 @@ def _find_counted(scene: Scene) -> Bool[np.ndarray, "p"]:
 
 
 def gather_evidence(
-    fit: Fit, surface: js.RefinedSurface, areas: Float[np.ndarray, "v"], covered: Bool[np.ndarray, "v"]
+    fit: Fit,
+    surface: js.RefinedSurface,
+    areas: Float[np.ndarray, "v"],
+    covered: Bool[np.ndarray, "v"],
+    crossings: js.Crossings | None = None,
 ) -> Evidence:
     """All that the checks look at."""
     look, counted = fit.look, _find_counted(fit.scene)
@@ -156,4 +162,5 @@ def gather_evidence(
         sides=unit(take_at_pairs(np.asarray(surface.normals, np.float64), look)),
         areas=areas,
         covered=covered,
+        crossings=crossings,
     )

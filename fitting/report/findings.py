@@ -6,6 +6,9 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Float
 
+import jaxsubdiv as js
+from jaxsubdiv.errors import name_rows
+
 from ..finding import Finding
 from .coverage import unit
 from .evidence import NOISE_OVER_EDGE, NOISE_OVER_OWN, Evidence, are_among_their_own, find_two_walls, rests_far_off
@@ -152,6 +155,24 @@ def check_jumps(seen: Evidence) -> Finding | None:
     )
 
 
+def check_crossings(seen: Evidence) -> Finding | None:
+    """Whether the surface goes through itself."""
+    found = seen.crossings
+    if found is None or not len(found.triangles):
+        return None
+    fit = seen.fit
+    start = js.find_crossings(js.refine(fit.model.scheme, fit.topology, fit.start)).triangles
+    since = "The surface did not where the fit started."
+    if len(start):
+        since = f"Where the fit started {len(start)} did already, rows {name_rows(start)}: mend the control mesh there."
+    return Finding(
+        "surface_crosses_itself",
+        f"{len(found.triangles):,} of the surface's {found.n_triangles:,} triangles go through others, rows "
+        f"{name_rows(found.triangles)}, around ({_place(np.median(found.places, axis=0))}). {since}",
+        {"triangles": len(found.triangles), "at_start": len(start), "share": len(found.triangles) / found.n_triangles},
+    )
+
+
 def _place(at: Float[np.ndarray, "3"]) -> str:
     return ", ".join(f"{x:.0f}" for x in at)
 
@@ -165,4 +186,5 @@ CHECKS: tuple[Callable[[Evidence], Finding | None], ...] = (
     check_two_walls,
     check_facing,
     check_jumps,
+    check_crossings,
 )

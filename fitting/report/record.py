@@ -17,6 +17,7 @@ from ..model.residual import Held, Model
 from ..model.unknowns import Variables
 from ..scan.regions import RegionMatch
 from ..scan.scan import Scan
+from ..solve.collision_free import make_guard
 from ..solve.sparse_normal import SparseEquations
 from ..solve.strengths import Strengths
 from ..solve.structure import Structure, find_structure
@@ -118,7 +119,11 @@ class Fit:
 
     def gather_held(self) -> Held:
         """What the sweep after the last would hold fixed: the `args` of its residual."""
-        held, _ = hold_priors(self.model, self.y, self.surface(), self.strengths.values, self.scene)
+        surface = self.surface()
+        held, _ = hold_priors(self.model, self.y, surface, self.strengths.values, self.scene)
+        guard = make_guard(self.model, self.y)
+        if guard is not None:
+            held |= {"contact": guard.find_contacts(surface, self.look, guard.crossing_faces(surface))}
         return hold_sweep(self.model, self.y, self.scene, self.look, self.look.at, self.strengths, held)
 
     def equations(self) -> SparseEquations:

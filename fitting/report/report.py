@@ -89,7 +89,7 @@ class Report:
             below -0.2. None where the scheme does not look at normals.
         measures: volume, area and so on, with standard deviations; empty where these were not asked for.
         crossing_triangles: how many triangles of the surface go through others of it, a quad being two; None where
-            that was not asked for, or the extra `contact` is not installed.
+            that was not looked for: the extra `contact` is not installed, or the fit is of a series.
         crossings_at: x, y, z in mm, the middle of the crossings; None where there are none.
         uncertainty_median, uncertainty_95: median and 95th percentile, over the covered area, of the surface's standard
             deviation; None where it was not asked for.
@@ -188,7 +188,9 @@ class Report:
         if self.least_margin is not None:
             rows.append(("least margin of a normal", f"{self.least_margin:+.2f}"))
         rows += [(one.name, str(one)) for one in self.measures]
-        if self.crossing_triangles is not None:
+        if self.crossing_triangles is None:
+            rows.append(("triangles that cross others", "not looked for: it takes the extra `contact`, and no series"))
+        else:
             where = ""
             if self.crossings_at is not None:
                 where = f", around ({', '.join(f'{x:.1f}' for x in self.crossings_at)})"

@@ -121,7 +121,9 @@ class FitResult:
     def warnings(self) -> list[Finding]:
         """What speaks against the fit, and against where it started; empty where nothing does."""
         areas, to_scan = self._seen_from_the_scan
-        return find_what_speaks_against(gather_evidence(self.fit, self.surface, areas, ~np.isnan(to_scan)))
+        return find_what_speaks_against(
+            gather_evidence(self.fit, self.surface, areas, ~np.isnan(to_scan), self.crossings)
+        )
 
     @property
     def trusted(self) -> bool:
@@ -136,7 +138,10 @@ class FitResult:
 
     @functools.cached_property
     def crossings(self) -> js.Crossings | None:
-        """Where the surface goes through itself; None where the extra `contact` is not installed."""
+        """Where the surface goes through itself; None where that is not looked for: without the extra `contact`, and in
+        series, whose frames lie in each other."""
+        if self.fit.inputs.get("frames") is not None:
+            return None
         try:
             return js.find_crossings(self.surface)
         except ImportError:
@@ -299,8 +304,7 @@ class FitResult:
         """The fit in numbers: `print` it, or take `.as_dict()`.
 
         Args:
-            uncertainty: with that of the surface, with `measures`, and with the triangles that cross others, which
-                takes a second or more.
+            uncertainty: with that of the surface and with `measures`, which takes a second or more.
             details: with the details of `measures`, too.
         """
         areas, to_scan = self._seen_from_the_scan
@@ -309,7 +313,7 @@ class FitResult:
         known, share = bool(areas_there.sum() > 0), areas_there / max(areas_there.sum(), np.finfo(float).tiny)
         spread = self.uncertainty().surface[covered] if uncertainty and known else None
         edge = float(js.edge_length(self.fit.topology, self.control.vertices))
-        crossings = self.crossings if uncertainty else None
+        crossings = self.crossings
         return Report(
             trusted=self.trusted,
             warnings=self.warnings,

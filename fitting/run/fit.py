@@ -34,6 +34,7 @@ from ..report.result import FitResult
 from ..scan.landmarks import Landmarks
 from ..scan.regions import RegionMatch
 from ..scan.scan import Scan, ScanError
+from ..solve.collision_free import can_find_crossings, make_guard
 from ..solve.conjugate_gradients import ConjugateGradients
 from ..solve.pilot import FromPilot
 from ..solve.sparse_normal import SparseNormal
@@ -162,6 +163,7 @@ def fit(
     kept = None if checkpoint is None else Checkpoint(Path(checkpoint) / CHECKPOINT, given | settings)
     inputs = gather_inputs(scheme, topology, control, scan, free, landmarks, landmark_deviation, boundary)
     inputs |= {"symmetry": symmetry, "alike": alike, "regions": regions, "layers": layers}
+    inputs["no_crossing"] = choose_solver(linear_solver) == "sparse" and can_find_crossings()
     model, y = analyse(scheme, topology, control, free, priors, inputs)
     scene = make_scene(scan, model.refine(y), inputs["slices"], choose_faces(regions, model, y, scan))
     solver = make_solver(model, y, scene, linear_solver, loss, tolerance, max_sweeps)
@@ -237,9 +239,9 @@ def make_solver(
     strengths: FromScan | FromPilot | None = None,
 ) -> Sweeps:
     """The solver of a fit, whose strengths by default follow from the scan."""
-    if linear_solver is None:
-        linear_solver = "sparse" if jax.default_backend() == "cpu" else "conjugate gradients"
-    if linear_solver == "sparse":
+    guard = None
+    if choose_solver(linear_solver) == "sparse":
+        guard = make_guard(model, y)
         held, _ = hold_priors(model, y, model.refine(y), first_strengths(model).values, scene)
         solver = SparseNormal(find_structure(model, y, held))
     else:
@@ -252,7 +254,13 @@ def make_solver(
         rtol=tolerance,
         max_sweeps=max_sweeps,
         folds=Folds(model.topology),
+        guard=guard,
     )
+
+
+def choose_solver(linear_solver: LinearSolver | None) -> LinearSolver:
+    """The linear solver of a fit; by default "sparse" on the CPU."""
+    return linear_solver or ("sparse" if jax.default_backend() == "cpu" else "conjugate gradients")
 
 
 def gather_inputs(

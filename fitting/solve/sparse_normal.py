@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..model.priors import AbstractVertexPrior
+from ..model.priors import AbstractSurfacePrior, AbstractVertexPrior
 from ..model.priors.shifts import ShiftPrior
 from ..model.residual import Held, Model, signed_distances
 from ..model.unknowns import Unknowns, Variables
@@ -32,7 +32,7 @@ from .elements import (
     slopes_of_rows,
     times_transposed,
 )
-from .structure import Structure, Tied, find_structure, row_faces, sparse_rows
+from .structure import Structure, Tied, find_structure, held_of_faces, row_faces, sparse_rows
 
 _REGULAR = 1e-12  # of the largest entry: what no row determines stays
 
@@ -58,7 +58,6 @@ class SparseEquations:
     """Linearised rows about one place on the host: what scan and priors say of the unknowns."""
 
     def __init__(self, structure: Structure, model: Model, y: Variables, held: Held):
-        self.structure: Structure = structure
         self.model: Model = model
         self.y: Variables = y
         self.held: Held = held
@@ -67,20 +66,27 @@ class SparseEquations:
         self.values: dict[str, Float[np.ndarray, "m"]] = {}
         """Rows of each prior, before they are weighed."""
         self._row_faces = row_faces(model, held.priors)
-        self.found: Derivatives = differentiate(bare, y, held.priors, structure.elements.seeds)
+        of_faces = held_of_faces(model, held.priors)
+        self.found: Derivatives = differentiate(bare, y, of_faces, structure.elements.seeds)
         self._by: dict[str, Float[np.ndarray, "m d"]] = {}
-        self._tied_jacobians: dict[str, sp.csr_array] = {}
-        self._known: dict[tuple[str, bytes], ArrowheadFactor] = {}
+        self._jacobians: dict[str, sp.csr_array] = {}
+        self._known: dict[tuple[str, bytes, bytes], ArrowheadFactor] = {}
+        of_surface = [self._add_surface_prior(structure, prior) for prior in model.surface_priors]
+        for matrix in of_surface:
+            structure = structure.including(matrix)
+        self.structure: Structure = structure
         self.data: Arrowhead = self._add_distances()
         self.prior: Arrowhead = self._add_face_priors()
+        for matrix in of_surface:
+            self.prior = self.prior.add(structure.arrange_sparse(matrix))
         for tied in structure.tied:
             self.prior = self.prior.add(self._add_tied(tied))
 
     def jacobian(self, name: str) -> sp.csr_array:
         """Derivatives of the rows of a prior by all unknowns; 0 by those that are fixed."""
         n = self.model.layout.n
-        if name in self._tied_jacobians:
-            by = self._tied_jacobians[name]
+        if name in self._jacobians:
+            by = self._jacobians[name]
         else:
             faces = self._row_faces[self._rows_of[name]]
             by = jacobian(self.structure.elements, self._by[name], faces)
@@ -101,10 +107,11 @@ class SparseEquations:
         """Solves with the damped normal matrix of "all" rows, or of those of the "prior"s alone: exactly, or where
         priors couple vertices far from each other by conjugate gradients, the near part of the matrix going before."""
         matrix = self.prior if which == "prior" else self.data.add(self.prior)
-        factor = self._known.get((which, damping.tobytes()))
+        key = which, damping.tobytes(), b"" if active is None else active.tobytes()
+        factor = self._known.get(key)
         is_near = self.structure.near is not None
         if factor is None:
-            factor = self._known[which, damping.tobytes()] = self.factorise(matrix, damping, active, near=is_near)
+            factor = self._known[key] = self.factorise(matrix, damping, active, near=is_near)
         free = self._free_mask(active)[:, None]
         if not is_near:
             return lambda sides: free * factor.solve(free * sides)
@@ -293,11 +300,30 @@ class SparseEquations:
         rows, by = np.asarray(rows, np.float64), np.asarray(by, np.float64)
         by = np.take_along_axis(by.T, tied.seeds_of, axis=1) if len(by) else np.zeros(tied.columns.shape)
         found = sparse_rows(by, tied.columns, layout.n)
-        weights = np.broadcast_to(np.asarray(self.held.precisions[prior.name], np.float64), rows.shape)
-        self._tied_jacobians[prior.name] = found
-        self.values[prior.name] = rows
+        return self.structure.arrange_sparse(self._add_rows(prior.name, rows, found))
+
+    def _add_surface_prior(self, structure: Structure, prior: AbstractSurfacePrior) -> sp.csc_array:
+        """The matrix of the rows of a prior that ties vertices of the surface."""
+        elements, held, n = structure.elements, self.held.priors[prior.name], self.model.layout.n
+        corners = np.asarray(prior.corners(held))
+        rows, slopes = prior.linearise(np.asarray(self.found.surface, np.float64), held)
+        found = sp.csr_array((len(rows), n))
+        if len(rows):
+            of_surface = np.asarray(self.found.of_surface)
+            faces = structure.faces_of_vertices(of_surface.shape[1])[corners]
+            for corner, face, slope in zip(corners.T, faces.T, slopes.transpose(1, 0, 2), strict=True):
+                along = np.einsum("mx,smx->sm", slope, of_surface[:, corner])
+                by = jacobian(elements, slopes_of_rows(elements, along, face), face)
+                found += sp.csr_array((by.data, by.indices, by.indptr), shape=(len(rows), n))
+        return self._add_rows(prior.name, rows, found)
+
+    def _add_rows(self, name: str, rows: Float[np.ndarray, "m"], found: sp.csr_array) -> sp.csc_array:
+        """Keep the rows of a prior and their derivatives, and add them to the gradient; their matrix."""
+        weights = np.broadcast_to(np.asarray(self.held.precisions[name], np.float64), rows.shape)
+        self._jacobians[name] = found
+        self.values[name] = rows
         self.gradient += found.T @ (weights * rows)
-        return self.structure.arrange_sparse(sp.csc_array(found.T @ sp.csr_array(sp.diags_array(weights) @ found)))
+        return sp.csc_array(found.T @ sp.csr_array(sp.diags_array(weights) @ found))
 
 
 class SparseNormal(lx.AbstractLinearSolver):
@@ -376,7 +402,17 @@ def _solve(
 
 
 def sparse_solver(model: Model, y: Variables, held: Held) -> SparseNormal:
-    """The sparse normal equations of a residual's rows as a linear solver for `optx.GaussNewton`."""
+    """The sparse normal equations of a residual's rows as a linear solver for `optx.GaussNewton`.
+
+    Raises:
+        ValueError: places of the surface are in contact, whose rows depend on unknowns far apart.
+    """
+    for prior in model.surface_priors:
+        if len(prior.corners(held.priors[prior.name])):
+            raise ValueError(
+                f"the rows of {prior.name!r} depend on unknowns far apart, which this solver does not take: fit with "
+                "Priors(contact=0), or give optimistix another linear solver."
+            )
     structure = find_structure(model, y, held.priors)
     faces = np.concatenate([structure.patches.owner[np.asarray(held.faces)], row_faces(model, held.priors)])
     return SparseNormal(structure, faces, ("distance", *(prior.name for prior in model.face_priors)))

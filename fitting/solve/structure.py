@@ -1,12 +1,12 @@
 """What the analysis of a model finds: which unknowns its rows depend on, and where their products stand in a matrix."""
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 import jaxsubdiv as js
 
@@ -41,21 +41,37 @@ class Structure:
     elements: Elements
     patches: Patches
     tied: list[Tied]
+    fixed: Bool[np.ndarray, "o"]
+    """Which unknowns of vertices may not move."""
     pattern: sp.csc_array
     """Of A."""
     near: sp.csc_array | None
     """Without the rows of priors that couple vertices far from each other; None where there are none."""
-    diagonal: Int[np.ndarray, "o"]
-    """Where in A's values its diagonal stands."""
-    fixed_entries: Int[np.ndarray, "_"]
-    """Where the rows and columns of fixed unknowns stand."""
-    from_elements: tuple[Int[np.ndarray, "_"], Int[np.ndarray, "_"]]
-    """Entries of the elements' pattern that belong to A, and where they stand there."""
 
     @property
     def n(self) -> int:
         """Number of unknowns of A."""
         return self.layout.n_own
+
+    @functools.cached_property
+    def diagonal(self) -> Int[np.ndarray, "o"]:
+        """Where in A's values its diagonal stands."""
+        return np.flatnonzero(self.pattern.indices == _columns(self.pattern))
+
+    @functools.cached_property
+    def fixed_entries(self) -> Int[np.ndarray, "_"]:
+        """Where the rows and columns of fixed unknowns stand."""
+        return np.flatnonzero(self.fixed[self.pattern.indices] | self.fixed[_columns(self.pattern)])
+
+    @functools.cached_property
+    def from_elements(self) -> tuple[Int[np.ndarray, "_"], Int[np.ndarray, "_"]]:
+        """Entries of the elements' pattern that belong to A, and where they stand there."""
+        of_elements, n = self.elements.pattern, self.n
+        column = _columns(of_elements)
+        source = np.flatnonzero((of_elements.indices < n) & (column < n))
+        return source, np.searchsorted(
+            _keys(self.pattern), column[source].astype(np.int64) * n + of_elements.indices[source]
+        )
 
     @functools.cached_property
     def symbolic(self) -> Symbolic:
@@ -73,6 +89,16 @@ class Structure:
         faces = np.zeros(n, np.int64)
         faces[self.patches.corners] = self.patches.owner[:, None]
         return faces
+
+    def including(self, more: sp.sparray) -> "Structure":
+        """The structure with the entries of another matrix of all unknowns, which rows of one sweep alone couple."""
+        n = self.n
+        own = sp.coo_array(sp.csc_array(more)[:n, :n])
+        if np.isin(own.col.astype(np.int64) * n + own.row, _keys(self.pattern)).all():
+            return self
+        entries = sp.csc_array((np.ones(own.nnz), (own.row, own.col)), shape=(n, n))
+        near = None if self.near is None else _sort(self.near + entries)
+        return replace(self, pattern=_sort(self.pattern + entries), near=near)
 
     def arrange(self, values: Float[np.ndarray, "_"], n_shared: int) -> Arrowhead:
         """The arrowhead of values in the pattern of the elements, in which h stands after the unknowns of vertices."""
@@ -114,7 +140,7 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> Structur
     rows = row_faces(model, held)
     for rings in range(1, _MOST_RINGS + 1):
         elements = find_elements(model, rings)
-        found = differentiate(model, y, held, elements.seeds)
+        found = differentiate(model, y, held_of_faces(model, held), elements.seeds)
         if not forgets_some(elements, patches, found, rows):
             break
     else:
@@ -124,7 +150,8 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> Structur
         )
     layout, n = model.layout, model.layout.n_own
     tied = [_tie(model, prior) for prior in model.vertex_priors]
-    pattern = sp.csc_array(abs(sp.csc_array(elements.pattern.astype(float))[:n, :n])) + sp.eye_array(n, format="csc")
+    own = sp.csc_array(abs(sp.csc_array(elements.pattern.astype(float))[:n, :n]))
+    pattern = sp.csc_array(own + sp.eye_array(n, format="csc"))
     pattern.data[:] = 1
     near = None
     for one in sorted(tied, key=lambda one: one.is_distant):
@@ -132,23 +159,13 @@ def find_structure(model: Model, y: Variables, held: dict[str, Any]) -> Structur
             near = _sort(pattern)
         by = sparse_rows(np.ones(one.columns.shape), one.columns, layout.n)
         pattern = pattern + abs(sp.csc_array((by.T @ by)[:n, :n]))
-    pattern = _sort(pattern)
-    keys, column = _keys(pattern), _columns(pattern)
-    of_elements = elements.pattern
-    source = np.flatnonzero((of_elements.indices < n) & (_columns(of_elements) < n))
-    place = np.searchsorted(keys, _columns(of_elements)[source].astype(np.int64) * n + of_elements.indices[source])
     fixed = np.asarray(model.is_free)[:n] == 0
-    return Structure(
-        layout,
-        elements,
-        patches,
-        tied,
-        pattern,
-        near,
-        np.flatnonzero(pattern.indices == column),
-        np.flatnonzero(fixed[pattern.indices] | fixed[column]),
-        (source, place),
-    )
+    return Structure(layout, elements, patches, tied, fixed, _sort(pattern), near)
+
+
+def held_of_faces(model: Model, held: dict[str, Any]) -> dict[str, Any]:
+    """What the face priors hold."""
+    return {prior.name: held[prior.name] for prior in model.face_priors}
 
 
 def row_faces(model: Model, held: dict[str, Any]) -> Int[np.ndarray, "m"]:

@@ -30,6 +30,7 @@ from ..model.robust import AbstractLoss, geman_mcclure
 from ..model.unknowns import AnyArray, Variables
 from ..scan.closest_points import closest_points
 from ..start.folds import Folds
+from .collision_free import CrossingGuard
 from .conjugate_gradients import ConjugateGradients
 from .pilot import FromPilot
 from .sparse_normal import SparseNormal
@@ -107,6 +108,7 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
             this part of the surface's uncertainty, or of a hundredth of a control edge, where that is more.
         max_sweeps: how many steps at most.
         folds: which control faces lie beside which.
+        guard: keeps the surface from passing through itself, on the host; None lets it.
     """
 
     linear_solver: SparseNormal | ConjugateGradients
@@ -115,6 +117,7 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
     rtol: Any
     max_sweeps: int = eqx.field(static=True)
     folds: Folds
+    guard: CrossingGuard | None = eqx.field(static=True, default=None)
     atol: Any = 0.0
     norm: Callable = optx.max_norm
 
@@ -228,9 +231,17 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
         """Take the most probable step, and find the next strengths and damping."""
         (model, scene), xp = subject, np if self._on_host else jnp
         strengths, damping, loose = state.strengths, state.damping, loose_damping(model, xp)
+        crossing = np.zeros(0, bool)
+        if self.guard is not None:
+            crossing = self.guard.crossing_faces(surface)
+            held = held | {"contact": self.guard.find_contacts(surface, state.look, crossing)}
         fixed = hold_sweep(model, y, scene, state.look, at, strengths, held, xp)
         rows = self.linear_solver.linearise(model, y, fixed)
         active = active_unknowns(model, state.shifting, xp)
+
+        def refine(step: AnyArray) -> tuple[Variables, js.RefinedSurface]:
+            proposed = _retract(model, y, jnp.asarray(step, y.control.vertices.dtype))
+            return proposed, model.refine(proposed)
 
         def attempt(hold: AnyArray) -> tuple[AnyArray, AnyArray]:
             step = rows.step(hold, active)
@@ -255,6 +266,17 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
                 lambda carry: _next_try(carry, attempt, hold_faster),
                 (jnp.int32(0), hold, nothing[1], nothing[0]),
             )
+        whole = 1.0
+        if self.guard is not None:
+
+            def solve_again(crossing: AnyArray) -> AnyArray:
+                nonlocal hold
+                hold = hold_faster(hold, crossing)
+                return rows.step(hold, active & ~_columns_of_h(model))
+
+            step, whole = self.guard.shorten(
+                np.asarray(step), crossing, model.layout, lambda step: refine(step)[1], solve_again
+            )
         new_strengths = strengths
         if isinstance(self.strengths, FromScan):
             solve = rows.solver("all", loose, active)  # what damps a step says nothing of what the scan determines
@@ -268,9 +290,9 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
             new_strengths = self.strengths.update(model, strengths, rows, step, solve_prior, solve_all, xp)
         else:
             new_strengths = self.strengths.update(model, strengths, xp)
-        proposed = _retract(model, y, jnp.asarray(step, y.control.vertices.dtype))
-        refined = model.refine(proposed)
-        moved = measure_movement(surface, refined)
+        proposed, refined = refine(step)
+        # A step that was shortened as a whole is no rest.
+        moved = measure_movement(surface, refined) if whole == 1 else np.full((), np.inf, model.edge.dtype)
         finite = jnp.isfinite(refined.vertices).all()
         new_damping = Damping(next_damping(model, damping, step, loose, state.shifting, xp), step)
         after = State(
@@ -291,6 +313,12 @@ class Sweeps(optx.AbstractLeastSquaresSolver):
         moved = before + step[: layout.n_own].reshape(layout.n_vertices, layout.width)[:, :3]
         turned = self.folds.find_turned_over(moved, xp) & ~self.folds.find_turned_over(before, xp)
         return self.folds.corners_of(turned, xp)
+
+
+def _columns_of_h(model: Model) -> Bool[np.ndarray, "k"]:
+    """Which shared unknowns are tangent lengths."""
+    parts = [np.full(int(np.prod(of.shape, dtype=int)), name == "h") for name, of in model.layout.shared]
+    return np.concatenate([np.zeros(0, bool), *parts])
 
 
 def _next_try(carry: tuple, attempt: Callable, hold_faster: Callable) -> tuple:

@@ -152,3 +152,18 @@ class AbstractVertexPrior(AbstractPrior):
     def vertices(self) -> Int[AnyArray, "m c"]:
         """The control vertices of every row."""
         raise NotImplementedError
+
+
+class AbstractSurfacePrior(AbstractPrior):
+    """A prior whose rows each depend on few vertices of the surface, anywhere on it, and of which every sweep has
+    another number: so that no compiled program has to know it, their derivatives are found in numpy."""
+
+    def corners(self, held: Any) -> Int[AnyArray, "m c"]:
+        """The vertices of the surface of every row."""
+        raise NotImplementedError
+
+    def linearise(
+        self, vertices: Float[np.ndarray, "v 3"], held: Any
+    ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m c 3"]]:
+        """The rows, and their derivatives by the coordinates of these vertices."""
+        raise NotImplementedError
