@@ -5,6 +5,9 @@ from importlib.metadata import version as _version
 from . import losses as losses
 from ._admissible import admissible_margin as admissible_margin
 from ._admissible import corner_cosines as corner_cosines
+from ._bezier_patches import BezierPatches as BezierPatches
+from ._bezier_patches import make_patches as make_patches
+from ._bezier_patches import write_patches as write_patches
 from ._control import Control as Control
 from ._control import strong_float as strong_float
 from ._control_faces import child_edge_faces as child_edge_faces
@@ -69,9 +72,16 @@ from ._surface import corner_weights as corner_weights
 from ._surface import evaluate as evaluate
 from ._surface import sample as sample
 from ._surface import sum_corners as sum_corners
+from ._tetrahedra import Tetrahedra as Tetrahedra
+from ._tetrahedra import fill_with_tetrahedra as fill_with_tetrahedra
+from ._tetrahedra import write_tetrahedra as write_tetrahedra
+from ._tetrahedron_quality import TetrahedronQuality as TetrahedronQuality
 from ._topology import Real as Real
 from ._topology import Topology as Topology
 from ._topology import build_topology as build_topology
+from ._within_tolerance import WithinTolerance as WithinTolerance
+from ._within_tolerance import prepare_to_print as prepare_to_print
+from ._within_tolerance import refine_within as refine_within
 from .closest import FaceChoice as FaceChoice
 from .errors import MeshError as MeshError
 

@@ -1,23 +1,31 @@
-"""Refine a mesh file: `python -m jaxsubdiv IN OUT --levels 3`; or compare the schemes on one."""
+"""Refine a mesh file: `python -m jaxsubdiv IN OUT --levels 3`; compare the schemes on one; or export a surface."""
 
 import argparse
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import get_args
 
 import jax
 
 from . import _compare
 from ._admissible import warn_of_folds
+from ._control import Control
+from ._exports import EXPORTS, Command
 from ._io import read_mesh, write_mesh
 from ._mesh import ControlMesh
 from ._normals import Boundary, Weights
 from ._refine import refine
 from ._scheme.base import AbstractScheme, OldNormals
 from ._scheme.interpolating import Interpolating, Twist
+from ._surface import RefinedSurface
 from ._topology import MAX_LEVELS, build_topology
+from ._within_tolerance import prepare_to_print, refine_within
 from .console import simplify_warnings, survive_closed_streams
 from .errors import MeshError
+
+_LEVELS = 3
+_COMMANDS = {"compare": Command(_compare.parser, _compare.run), **EXPORTS}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -28,12 +36,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(arguments: Sequence[str] | None) -> int:
     words = sys.argv[1:] if arguments is None else list(arguments)
-    comparing = words[:1] == ["compare"]
-    options = _compare.parser().parse_args(words[1:]) if comparing else _parser().parse_args(words)
+    command = _COMMANDS.get(words[0]) if words else None
+    options = _parser().parse_args(words) if command is None else command.parser().parse_args(words[1:])
     # A file is refined once: twice the digits cost nothing that one would notice.
     jax.config.update("jax_enable_x64", True)
     try:
-        return _compare.run(options) if comparing else _run(options)
+        return _run(options) if command is None else command.run(options)
     except (MeshError, OSError, ValueError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -52,12 +60,26 @@ def _run(options: argparse.Namespace) -> int:
     control = mesh.control(weights=scheme.weights)
     if mesh.normals is None and scheme.uses_normals and not scheme.recomputes_normals:
         warn_of_folds(mesh, control)  # `build_topology` does where the normals were given
-    topology = build_topology(mesh, scheme, options.levels, mesh_normals=options.normals_out == "mesh")
-    surface = refine(scheme, topology, control)
+    surface = _refine_as_asked(scheme, mesh, control, options)
     write_mesh(options.output, surface)
     kinds = f"{len(surface.faces[3]):,} triangles, {len(surface.faces[4]):,} quads"
     print(f"wrote    {options.output}: {len(surface.vertices):,} vertices, {kinds}")
     return 0
+
+
+def _refine_as_asked(
+    scheme: AbstractScheme, mesh: ControlMesh, control: Control, options: argparse.Namespace
+) -> RefinedSurface:
+    """By so many levels, or by those that a tolerance takes; the latter to be printed where it goes to STL."""
+    mesh_normals = options.normals_out == "mesh"
+    if options.tolerance is None:
+        topology = build_topology(
+            mesh, scheme, _LEVELS if options.levels is None else options.levels, mesh_normals=mesh_normals
+        )
+        return refine(scheme, topology, control)
+    found = refine_within(scheme, mesh, control, options.tolerance, mesh_normals=mesh_normals)
+    print(f"refined  {found.levels} times: the limit is within {found.largest:.3g} of the faces, RMS {found.rms:.3g}")
+    return prepare_to_print(found.surface) if Path(options.output).suffix.lower() == ".stl" else found.surface
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -65,14 +87,25 @@ def _parser() -> argparse.ArgumentParser:
         prog="jaxsubdiv",
         description="Refine a mesh of triangles and quads by interpolating subdivision: every level makes four times "
         "the faces, and the vertices of the input stay where they are.",
-        epilog="`jaxsubdiv compare MESH --truth SURFACE` measures all schemes on a mesh; see its own --help. "
+        epilog="`jaxsubdiv compare MESH --truth SURFACE` measures all schemes on a mesh, `jaxsubdiv tetrahedra SURFACE "
+        "OUT.vtu` fills a surface, and `jaxsubdiv patches MESH OUT.vtu` writes Bézier patches; see their own --help. "
         "Files: .obj .ply .off .stl .npz; .vtp .vtk .gii with the extra `io`. The formats differ in what they "
         "hold: .stl has no quads. Exit status: 0 done, 2 the input or the arguments cannot be used.",
     )
     add = parser.add_argument
     add("input", metavar="IN", help="control mesh")
     add("output", metavar="OUT", help="refined mesh; an older file is replaced once the new one is complete")
-    add("--levels", type=int, default=3, metavar="N", help=f"how many levels, 0 to {MAX_LEVELS} (default: 3)")
+    how_fine = parser.add_mutually_exclusive_group()
+    how_fine.add_argument(
+        "--levels", type=int, metavar="N", help=f"how many levels, 0 to {MAX_LEVELS} (default: {_LEVELS})"
+    )
+    how_fine.add_argument(
+        "--tolerance",
+        type=float,
+        metavar="MM",
+        help="as many levels as bring the flat faces so near to the limit surface, which is measured; .stl is then "
+        "written to be printed, in single precision and watertight",
+    )
     add(
         "--h",
         type=float,

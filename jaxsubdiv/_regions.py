@@ -36,7 +36,7 @@ class Regions(eqx.Module):
     rows: Int[np.ndarray, "n"] = eqx.field(converter=_check_whole)
     names: tuple[str, ...] = eqx.field(converter=_words, static=True)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         wrong = np.flatnonzero((self.rows < -1) | (self.rows >= len(self.names)))
         if len(wrong):
             raise ValueError(

@@ -1,10 +1,19 @@
 """Settings of every test: double precision, no silent promotion, shapes checked while the code runs."""
 
+import atexit
 import itertools
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy loads: threads of two workers wait for one another
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # workers find it there: what one has compiled, the others load
+    _programs = tempfile.mkdtemp(prefix="jaxsubdiv_tests_")
+    atexit.register(shutil.rmtree, _programs, ignore_errors=True)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _programs
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 
 import jax
 import jaxtyping
@@ -31,7 +40,9 @@ _LONGEST = (
     "test_likeness",
     "test_engine",
     "test_fit",
-    "test_commands",
+    "test_examples",
+    "test_command_fit",
+    "test_command_endings",
 )
 
 

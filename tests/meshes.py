@@ -141,3 +141,8 @@ def _convex(vertices, faces) -> Mesh:
         angles = np.arctan2(corners @ up / np.linalg.norm(up), (corners - middle) @ right / np.linalg.norm(right))
         turned.append(tuple(int(face[i]) for i in np.argsort(angles % (2 * np.pi))))
     return vertices, turned
+
+
+def turns(triangles) -> set[tuple[int, ...]]:
+    """Triangles as they are turned, whichever corner is named first."""
+    return {tuple(np.roll(row, -int(np.argmin(row))).tolist()) for row in np.asarray(triangles)}

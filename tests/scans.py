@@ -81,3 +81,7 @@ def assert_refit_knows_the_fit(result: fitting.FitResult) -> None:
     gradient = result.fit.equations().gradient
     expected, size = np.asarray(fixed.whitening).T @ gradient, float(np.linalg.norm(fixed.left))
     np.testing.assert_allclose(fixed.left, expected, rtol=1e-3, atol=1e-3 * size)
+
+
+def rms(values) -> float:
+    return float(np.sqrt(np.mean(np.asarray(values) ** 2)))

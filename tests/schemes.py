@@ -176,3 +176,10 @@ def random_control(mesh: Mesh, seed: int, bumps: float = 0.05) -> js.Control:
     vertices = mesh[0] + rng.uniform(-bumps, bumps, mesh[0].shape)
     own = np.asarray(js.ControlMesh(vertices, mesh[1]).control().normals)
     return js.Control(vertices, (own + rng.uniform(-0.5, 0.5, own.shape)) * rng.uniform(0.5, 2, (len(own), 1)))
+
+
+def torus(n: int, kind: str) -> js.ControlMesh:
+    """Around the tube `n` cells, with the torus's own normals."""
+    vertices, faces = meshes.torus(2 * n, n, kind)
+    outward = vertices * (1, 1, 0)
+    return js.ControlMesh(vertices, faces, vertices - 2 * outward / np.linalg.norm(outward, axis=1, keepdims=True))

@@ -9,13 +9,15 @@ import matplotlib.pyplot as plt
 import pytest
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
-# What a notebook needs beside the extra `test`, and sizes at which it is run here: those of the notebook take minutes.
-NEEDS = {"08_train_a_layer": "optax"}
+# What a notebook needs of the extra `test`, and sizes at which it is run here: those of the notebook take minutes.
+NEEDS = {"08_train_a_layer": ("optax",), "09_to_simulation": ("skfem", "pytetwild")}
+MIXES_TYPES = ("08_train_a_layer",)  # optimisers multiply floating numbers by whole ones
 SMALLER = {
+    "09_to_simulation": ("edge, depth = 7.0, 2.0", "edge, depth = 12.0, 2.0"),
     "08_train_a_layer": (
         "n_steps, batch, n_target, n_held_out, levels = 400, 8, 800, 8, 2",
         "n_steps, batch, n_target, n_held_out, levels = 3, 2, 40, 1, 1",
-    )
+    ),
 }
 
 
@@ -30,11 +32,9 @@ def test_there_are_notebooks():
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_runs_from_top_to_bottom(path, monkeypatch, tmp_path):
-    if path.stem in NEEDS:
-        pytest.importorskip(NEEDS[path.stem])
-        with jax.numpy_dtype_promotion("standard"):  # optimisers multiply floating numbers by whole ones
-            _run(path, monkeypatch, tmp_path)
-    else:
+    for module in NEEDS.get(path.stem, ()):
+        pytest.importorskip(module)
+    with jax.numpy_dtype_promotion("standard" if path.stem in MIXES_TYPES else "strict"):
         _run(path, monkeypatch, tmp_path)
 
 

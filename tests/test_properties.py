@@ -1,51 +1,20 @@
 """What is true of the refinement, as tests over every scheme and option for which it should hold."""
 
-import functools
-
-import jax
-import jax.numpy as jnp
 import meshes
 import numpy as np
 import pytest
 import reference
-from schemes import (
-    CASES,
-    LEVELS,
-    MIXED,
-    SHEET,
-    Case,
-    by_name,
-    control_mesh,
-    inherited,
-    on_host,
-    over_cases,
-    refined,
-)
+from refined import CONTROL, DEFAULT, X, refine, unit
+from schemes import CASES, LEVELS, MIXED, SHEET, Case, by_name, control_mesh, inherited, on_host, over_cases, refined
 
 import jaxsubdiv as js
-from jaxsubdiv._refine import _refine
 
-DEFAULT = by_name("default")
-CONTROL, X, N, PART = DEFAULT.subject.control, DEFAULT.subject.x, DEFAULT.subject.n, DEFAULT.subject.part
 ROTATION = np.linalg.qr(np.random.default_rng(6).normal(size=(3, 3)))[0]
 ROTATION *= np.linalg.det(ROTATION)
 
 
-def refine(scheme: js.AbstractScheme, mesh: meshes.Mesh, levels: int, normals=None) -> js.RefinedSurface:
-    """Refine a mesh with the normals given, or with its own."""
-    checked = js.ControlMesh(*mesh, normals)
-    return on_host(js.refine(scheme, js.build_topology(checked, scheme, levels), checked.control()))
-
-
-def unit(rows) -> np.ndarray:
-    return np.asarray(rows) / np.linalg.norm(rows, axis=-1, keepdims=True)
-
-
 def part_of_vertex(case: Case) -> np.ndarray:
     return np.round(inherited(case.topology, case.subject.part)).astype(int)
-
-
-# ------------------------------------------------------------------------------------------------ what stays as it is
 
 
 @over_cases(interpolates=True)
@@ -128,9 +97,6 @@ def test_eight_levels_run():
     # Triangles 1/256 of the first one in size, none of them folded back.
     a, b, c = np.moveaxis(surface.vertices[surface.faces[3]], 1, 0)
     assert np.all(np.cross(b - a, c - a) @ np.ones(3) > 0)
-
-
-# ------------------------------------------------------------------------------------------------------- equivariance
 
 
 @over_cases()
@@ -221,163 +187,6 @@ def test_components_do_not_feel_one_another(case):
     assert np.abs(other.vertices[~sheet] - surface.vertices[~sheet]).max() > 0.1
 
 
-# --------------------------------------------------------------------------------------------------- weights and PN
-
-
-def stencil(mesh: meshes.Mesh, h: float) -> tuple[js.Topology, np.ndarray]:
-    """Heights of the edge vertices over a flat sheet as weights of the control heights, normals from the mesh."""
-    scheme = js.Interpolating(h)
-    topology = js.build_topology(js.ControlMesh(*mesh), scheme, 1)
-
-    def heights(z: jax.Array) -> jax.Array:
-        vertices = jnp.concatenate([jnp.asarray(mesh[0][:, :2]), z[:, None]], axis=1)
-        control = js.Control(vertices, js.estimate_normals(topology.control_fans, vertices))
-        return js.refine(scheme, topology, control).vertices[len(z) :, 2]
-
-    return topology, np.asarray(jax.jit(jax.jacfwd(heights))(jnp.zeros(len(mesh[0]))))
-
-
-def weights_at(
-    mesh: meshes.Mesh, h: float, places: dict[float, list[tuple[int, int]]]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Weights of the edge from (2, 2) to (3, 2), and the expected ones: each weight with its places in the grid."""
-    topology, weights = stencil(mesh, h)
-    ends = at(2, 2), at(3, 2)
-    row = np.flatnonzero((np.sort(topology.levels[0].edges, axis=1) == ends).all(axis=1))
-    expected = np.zeros(len(mesh[0]))
-    for weight, cells in places.items():
-        expected[[at(*cell) for cell in cells]] = weight
-    return weights[row[0]], expected
-
-
-def at(x: int, y: int) -> int:
-    """Number of a vertex in a grid of 5 by 4 cells."""
-    return 5 * x + y
-
-
-@pytest.mark.parametrize("h", [1.0, 0.6])
-def test_edges_of_a_flat_quad_grid_have_the_four_point_weights(h):
-    w = h / 16
-    places = {1 / 2 + w: [(2, 2), (3, 2)], -w: [(1, 2), (4, 2)]}
-    np.testing.assert_allclose(*weights_at(meshes.grid(5, 4), h, places), rtol=0, atol=1e-15)
-
-
-@pytest.mark.parametrize("h", [1.0, 0.6])
-def test_edges_of_a_flat_triangle_grid_have_the_butterfly_weights(h):
-    vertices, faces = meshes.grid(5, 4, "triangle")
-    # The diagonals run from (0, 0) to (1, 1); sheared, the edges of all three directions are alike.
-    x, y = vertices[:, 0] - vertices[:, 1] / 2, np.sqrt(3) / 2 * vertices[:, 1]
-    tension, w = h / 16, -h / 24  # the two parameters of the 10-point butterfly
-    places = {
-        1 / 2 - w: [(2, 2), (3, 2)],
-        2 * (tension + w): [(3, 3), (2, 1)],
-        -tension - w: [(1, 1), (3, 1), (2, 3), (4, 3)],
-        w: [(1, 2), (4, 2)],
-    }
-    flat = np.stack([x, y, vertices[:, 2]], axis=1)
-    np.testing.assert_allclose(*weights_at((flat, faces), h, places), rtol=0, atol=1e-15)
-
-
-def test_first_edge_points_are_the_middles_of_the_pn_triangle():
-    rng = np.random.default_rng(8)
-    for _ in range(5):
-        vertices, normals = rng.normal(size=(2, 3, 3))
-        surface = refine(js.Interpolating(), (vertices, [(0, 1, 2)]), 1, normals)
-        middles = reference.pn_triangle_edge_middles(vertices, normals)
-        np.testing.assert_allclose(surface.vertices[[3, 5, 4]], middles, rtol=0, atol=1e-14)  # edges 01, 02, 12
-
-
-# ------------------------------------------------------------------------------------------------------------ accuracy
-
-
-@functools.cache
-def torus_error(circle: bool, h: float, n: int, kind: str) -> float:
-    """Largest distance from the torus of radii 2 and 1, `2 n` cells by `n`, with its own normals."""
-    scheme = js.CirclePreserving(h) if circle else js.Interpolating(h)
-    vertices, faces = meshes.torus(2 * n, n, kind)
-    surface = refine(scheme, (vertices, faces), 1, vertices - 2 * unit(vertices * (1, 1, 0)))
-    across = np.linalg.norm(surface.vertices[:, :2], axis=1) - 2
-    return np.abs(np.hypot(across, surface.vertices[:, 2]) - 1).max()
-
-
-@pytest.mark.parametrize("kind", ["quad", "triangle"])
-def test_order_is_four_with_exact_normals_and_h_one_alone(kind):
-    order, of_other_h = (np.log2(torus_error(False, h, 10, kind) / torus_error(False, h, 20, kind)) for h in (1.0, 1.2))
-    assert 3.7 < order < 4.3
-    assert of_other_h < 2.3
-
-
-def test_circle_preserving_scheme_is_closer_to_a_torus():
-    order = np.log2(torus_error(True, 1.0, 10, "quad") / torus_error(True, 1.0, 20, "quad"))
-    assert 3.7 < order < 4.3
-    assert torus_error(True, 1.0, 20, "quad") < torus_error(False, 1.0, 20, "quad") / 4
-
-
-@pytest.mark.parametrize(
-    ("name", "best"), [("tetrahedron", 1.83), ("octahedron", 1.46), ("icosahedron", 1.206), ("cube", 1.51)]
-)
-def test_best_constant_h_on_a_sphere(name, best):
-    vertices, faces = getattr(meshes, name)()
-    vertices = unit(vertices)
-
-    def error(h: float) -> float:
-        surface = refine(js.Interpolating(h), (vertices, faces), 4, vertices)
-        return np.mean((np.linalg.norm(surface.vertices, axis=1) - 1) ** 2)
-
-    step = 0.05
-    below, here, above = (error(best + shift) for shift in (-step, 0, step))
-    bottom = best + step / 2 * (below - above) / (below - 2 * here + above)  # of the parabola through all three
-    assert abs(bottom - best) < 0.015
-
-
-def test_displacements_shrink_to_about_a_third_a_level():
-    mesh, scheme, levels = meshes.icosahedron(), js.Interpolating(), 5
-    topology = js.build_topology(js.ControlMesh(*mesh), scheme, levels)
-    surface, first, largest = refine(scheme, mesh, levels), len(mesh[0]), []
-    for level in topology.levels:
-        edges = np.asarray(level.edges)
-        bend = surface.vertices[first : first + len(edges)] - surface.vertices[edges].mean(axis=1)
-        largest.append(np.linalg.norm(bend, axis=1).max())
-        first += len(edges) + len(level.quads)
-    ratios = np.divide(largest[1:], largest[:-1])
-    assert 0.30 < ratios[-1] < 0.36
-    assert np.all(np.diff(ratios) < 0)
-
-
-def on_a_sphere() -> np.ndarray:
-    """The parts of `MIXED` laid on the unit sphere, no two neighbours 120 degrees apart."""
-    sheets = np.isin(PART, (SHEET, SHEET + 1))
-    return unit(np.where(sheets[:, None], MIXED[0] * (0.4, 0.4, 0) + (0.1, 0, 1), X))
-
-
-@over_cases("sphere")
-def test_spheres_are_kept_by_schemes_that_claim_it(case):
-    normals, centre, radius = on_a_sphere(), np.array([3.0, -1.0, 2.0]), 5.0
-    surface = refined(case._replace(scheme=case.with_h(1.0)), js.Control(centre + radius * normals, normals))
-    np.testing.assert_allclose(surface.vertices, centre + radius * surface.normals, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(surface.vertices - centre, axis=1), radius, rtol=1e-13)
-
-
-def test_interpolating_scheme_leaves_a_sphere():
-    normals = on_a_sphere()
-    one = DEFAULT._replace(scheme=js.Interpolating())
-    lengths = np.linalg.norm(refined(one, js.Control(normals, normals)).vertices, axis=1)
-    assert np.abs(lengths - 1).max() > 0.01
-
-
-def test_round_cylinders_are_kept_by_the_circle_preserving_scheme():
-    angle, height, _ = meshes.grid(3, 2)[0].T
-    normals = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    mesh = (3 * normals + np.outer(height, (0, 0, 1)), meshes.grid(3, 2)[1])
-    surface = refine(js.CirclePreserving(), mesh, 1, normals)
-    outward = unit(surface.vertices * (1, 1, 0))
-    np.testing.assert_allclose(surface.vertices[:, :2], 3 * outward[:, :2], rtol=0, atol=1e-13)
-    np.testing.assert_allclose(surface.normals, outward, rtol=0, atol=1e-13)
-
-
-# -------------------------------------------------------------------------------------------------------------- counts
-
-
 def test_every_level_has_four_times_the_faces_and_the_same_euler_number():
     mesh = control_mesh(meshes.union(MIXED, meshes.torus(4, 3, "mixed")))
     finer = mesh
@@ -427,9 +236,6 @@ def test_coarser_levels_are_prefixes_of_finer_ones(name):
         np.testing.assert_allclose(coarser.normals, finer.normals[:n], rtol=0, atol=1e-14)
 
 
-# ------------------------------------------------------------------------------------------------------------- normals
-
-
 @pytest.mark.parametrize("weights", ["area", "uniform", "angle", "sphere"])
 def test_estimated_normals_agree_with_the_reference(weights):
     topology = DEFAULT.topology
@@ -451,76 +257,3 @@ def test_mesh_normals_are_those_of_the_last_level(name):
     plain = js.refine(scheme, js.build_topology(checked, scheme, 1), checked.control())
     np.testing.assert_allclose(surface.vertices, plain.vertices, rtol=0, atol=1e-14)
     assert np.abs(surface.normals[old] - plain.normals[old]).max() > 1e-3
-
-
-# -------------------------------------------------------------------------------------------- precision, compilation
-
-
-@pytest.mark.parametrize("name", ["default", "bezier-triangle", "catmull-clark", "butterfly"])
-def test_single_precision_stays_single_and_agrees(name):
-    case = by_name(name)
-    single = js.Control(case.subject.x.astype(np.float32), case.subject.n.astype(np.float32))
-    surface = js.refine(case.scheme, case.topology, single)
-    assert surface.vertices.dtype == surface.normals.dtype == np.float32
-    expected = refined(case, js.Control(*(np.asarray(rows, np.float64) for rows in (single.vertices, single.normals))))
-    np.testing.assert_allclose(surface.vertices, expected.vertices, rtol=0, atol=2e-6)
-    np.testing.assert_allclose(surface.normals, expected.normals, rtol=0, atol=2e-5)
-
-
-def test_single_precision_holds_a_metre_from_the_origin():
-    vertices, faces = meshes.icosahedron()
-    vertices = np.asarray(100 * vertices + (1000, -1000, 500), np.float32)  # mm
-    scheme, checked = js.Interpolating(), js.ControlMesh(vertices, faces)
-    topology = js.build_topology(checked, scheme, 5)
-    double = checked.control()
-    single, double = (
-        js.refine(scheme, topology, js.Control(vertices.astype(dtype), np.asarray(double.normals, dtype)))
-        for dtype in (np.float32, np.float64)
-    )
-    np.testing.assert_allclose(single.vertices, double.vertices, rtol=2e-7, atol=0)
-    sines = np.linalg.norm(np.cross(single.normals, double.normals), axis=1)
-    assert np.degrees(sines.max()) < 0.01
-
-
-def test_only_new_sizes_options_and_dtypes_compile_anew():
-    topology = DEFAULT.topology
-    js.refine(js.Interpolating(), topology, CONTROL)
-    compiled = _refine._cache_size()
-    for h in (1.2, 1, np.float64(0.9), jnp.asarray(0.9), jnp.asarray(0.9, jnp.float64)):
-        js.refine(js.Interpolating(h), topology, js.Control(2 * X, N.tolist()))
-    told, _, _ = meshes.relabelled(MIXED, seed=9)
-    js.refine(js.Interpolating(), js.build_topology(js.ControlMesh(*told), js.Interpolating(), LEVELS), CONTROL)
-    assert _refine._cache_size() == compiled
-    refine(js.Interpolating(), (np.eye(3), [(0, 2, 1)]), 1)
-    refine(js.Interpolating(weights="uniform"), (np.eye(3), [(0, 2, 1)]), 1)
-    assert _refine._cache_size() > compiled
-
-
-@over_cases()
-def test_refinement_is_gathers_and_sums_without_scatters(case):
-    program = _refine.lower(case.scheme, case.topology, case.subject.control).as_text()
-    assert "gather" in program and "scatter" not in program
-
-
-def test_gradients_have_the_scatters_that_a_search_would_find():
-    topology, scheme = DEFAULT.topology, js.Interpolating()
-    slope = jax.jit(jax.grad(lambda control: js.refine(scheme, topology, control).vertices.sum()))
-    assert "scatter" in slope.lower(CONTROL).as_text()
-
-
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="only the CPU backend is told to keep stages apart")
-def test_stages_stay_programs_of_their_own_forward_and_backward():
-    # Were they inlined by another XLA, or did they call on smaller ones, everything would be slower in silence.
-    topology, scheme = DEFAULT.topology, js.Interpolating()
-
-    def normals(control):
-        return jnp.sum(js.refine(scheme, topology, control).normals)
-
-    def calls(function):
-        # As users compile it, not as the tests do.
-        emitters = {"xla_cpu_use_fusion_emitters": True} if jax.__version_info__ < (0, 11) else None
-        return jax.jit(function).lower(CONTROL).compile(emitters).as_text().count(" call(")
-
-    # Points of edges and faces, their sums of corner normals, and those made unit.
-    assert calls(normals) == 6 * LEVELS
-    assert calls(jax.grad(normals)) in range(2 * 6 * LEVELS - 2, 3 * 6 * LEVELS)

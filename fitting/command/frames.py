@@ -21,6 +21,7 @@ from .progress import Progress
 _FRAMES = "frames"
 # Options that a series has no use for, and their values where they are not given.
 _UNUSED = {"tolerance": None, "points": None, "boundary": None, "landmarks": None, "carry": None, "mirror": False}
+_UNUSED |= {"surface_tolerance": None, "tetrahedra": None, "patches": None}
 _UNUSED |= {"resume": False, "symmetry": None, "prior": None, "template_out": None}
 
 

@@ -189,4 +189,6 @@ def mark_job(job: Job, recipe: Recipe, options: argparse.Namespace) -> dict[str,
     inputs |= {} if job.carried is None else {"carried landmarks": job.carried}
     if (options.surface, options.surface_level) != (["ply"], None):
         inputs["surface format or level"] = options.surface, options.surface_level
+    for name in ("surface_tolerance", "tetrahedra", "patches"):
+        inputs |= {} if getattr(options, name) is None else {name.replace("_", " "): getattr(options, name)}
     return marks_of(inputs | {field.name: getattr(recipe, field.name) for field in dataclasses.fields(recipe)})

@@ -8,6 +8,7 @@ from jaxsubdiv.console import simplify_warnings, survive_closed_streams
 
 from ..run.names import name_folder
 from ..run.surface_files import check_formats
+from .exports import check_exports
 from .frames import fit_frames
 from .inputs import find_sources
 from .many import fit_all
@@ -50,6 +51,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         check_options(options)
         scans, recipe = find_sources(options), make_recipe(options)
         check_formats(options.surface)
+        check_exports(options)
     except (ValueError, OSError, ImportError) as error:
         return report_failure(error)
     try:

@@ -6,6 +6,7 @@ import re
 import time
 import traceback
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,9 @@ from .progress import Progress
 REFUSALS = (js.MeshError, ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError)
 
 
-def fit_one(scan: Source | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str) -> dict:
+def fit_one(
+    scan: Source | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str
+) -> dict[str, Any]:
     """One fit: its row of the summary, whose status is 0, 1 for one not to be trusted, 2 for one that failed."""
     title, began = make_printable(title), time.perf_counter()
     try:
@@ -44,7 +47,9 @@ def fit_one(scan: Source | None, folder: Path, options: argparse.Namespace, reci
     return {"scan": title, "status": status, "seconds": f"{time.perf_counter() - began:.1f}"}
 
 
-def _fit_and_save(scan: Source | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str) -> dict:
+def _fit_and_save(
+    scan: Source | None, folder: Path, options: argparse.Namespace, recipe: Recipe, title: str
+) -> dict[str, Any]:
     began = time.perf_counter()
     job = read_inputs(scan, options, recipe)
     slices = "" if job.scan.slices is None else f" in {len(np.unique(job.scan.slices))} slices"
@@ -103,7 +108,7 @@ def find_done(folder: Path, marks: dict[str, str]) -> FitResult | None:
     return load(folder)
 
 
-def make_row(name: str, result: FitResult, off: float, seconds: float | None, details: bool) -> dict:
+def make_row(name: str, result: FitResult, off: float, seconds: float | None, details: bool) -> dict[str, Any]:
     """The row of a fit in the summary: its state, and every measure with its standard deviation."""
     report = result.report()
     return {

@@ -128,6 +128,29 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="N",
         help="levels of the surface that is written, 0 to 8 (default: those of the fit)",
     )
+    add(
+        "--surface-tolerance",
+        type=float,
+        metavar="MM",
+        help="as many levels as bring the flat faces of that surface so near to its limit, which is measured",
+    )
+    add(
+        "--tetrahedra",
+        nargs="?",
+        type=float,
+        const=True,
+        metavar="EDGE",
+        help="fill the closed surface for finite elements, with edges of about EDGE mm (default: a twentieth of the "
+        "diagonal): tetrahedra.vtu",
+    )
+    add(
+        "--patches",
+        nargs="?",
+        type=int,
+        const=1,
+        metavar="N",
+        help="the surface as Bézier patches, one a face at level N (default: 1): patches.vtu, and patches.xml of quads",
+    )
     add("--scheme", choices=tuple(SCHEMES), help="default: interpolating")
     add("--h", type=float, help="tangent length coefficient at the start, for schemes that have one (default: 1)")
     add("--max-sweeps", type=int, help=f"pairing and solving in turns (default: {Recipe.max_sweeps})")
@@ -148,9 +171,14 @@ def check_options(options: argparse.Namespace) -> None:
     """See that numbers lie in their ranges, and name them as they were typed."""
     names = {"tolerance_mm": "tolerance", "most_points": "points"}
     names |= {name: name for name in ("levels", "max_sweeps", "faces", "symmetry", "likeness", "h", "surface_level")}
-    names |= {name: name for name in ("scale", "control_scale")}
+    names |= {name: name for name in ("scale", "control_scale", "surface_tolerance")}
+    names |= {"patch_level": "patches"}
     typed = {name: f"--{option.replace('_', '-')}" for name, option in names.items()}
     check_numbers({name: getattr(options, option) for name, option in names.items()}, typed)
+    edge = None if options.tetrahedra is True else options.tetrahedra
+    check_numbers({"edge": edge}, {"edge": "--tetrahedra"})
+    if options.surface_level is not None and options.surface_tolerance is not None:
+        raise ValueError("--surface-tolerance finds the level of the surface: leave --surface-level out.")
     if options.carry and os.path.abspath(options.carry) in _landmark_files(options):
         raise ValueError(f"--carry {options.carry} would be replaced by the landmarks of the fit: give another -o OUT.")
 

@@ -20,6 +20,7 @@ from ..run.fit_scan import ScanFit
 from ..run.folder import CARRIED, LANDMARKS, fill_folder
 from ..run.surface_files import write_surface
 from ..scan.landmarks import write_landmarks
+from .exports import find_level, write_exports
 from .inputs import Job
 
 _LAYERS = "layers"
@@ -83,9 +84,10 @@ def _write_layers(folder: Path, found: LayersFit, options: argparse.Namespace, f
 def _write_surface(folder: Path, result: FitResult, options: argparse.Namespace, frame: Frame | None) -> list[str]:
     """The surface's files; where it has no such level, told, none: the fit itself is not lost."""
     try:
-        at = result.refine_to(options.surface_level)
+        at = result.refine_to(find_level(result, options))
         values = {"distance_mm": at.distances, "deviation_mm": at.deviations}
-        return write_surface(folder, at.surface, values, options.surface, frame)
+        written = write_surface(folder, at.surface, values, options.surface, frame)
+        return written + write_exports(folder, result, at, options)
     except (ValueError, MemoryError) as error:
         print(f"note     no surface: {str(error) or 'it takes more memory than there is'}")
         return []

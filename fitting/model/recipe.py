@@ -68,7 +68,7 @@ class Settings:
     mesh_normals: bool = False
     limit: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_numbers({name: getattr(self, name) for name in _NUMBERS})
 
     def topology(self, mesh: js.ControlMesh) -> js.Topology:

@@ -38,7 +38,7 @@ class Huber(AbstractLoss):
 
     c: Float[Array, ""] = eqx.field(converter=strong_float, default=1.345)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         check_numbers({"c": self.c})
 
     def weight(self, r: Float[Array, "*p"]) -> Float[Array, "*p"]:
@@ -55,7 +55,7 @@ class Barron(AbstractLoss):
     alpha: Float[Array, ""] = eqx.field(converter=strong_float, default=-2.0)
     c: Float[Array, ""] = eqx.field(converter=strong_float, default=3.0)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         check_numbers({"alpha": self.alpha, "c": self.c})
 
     def weight(self, r: Float[Array, "*p"]) -> Float[Array, "*p"]:
@@ -82,7 +82,7 @@ class Tukey(AbstractLoss):
 
     c: Float[Array, ""] = eqx.field(converter=strong_float, default=4.685)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         check_numbers({"c": self.c})
 
     def weight(self, r: Float[Array, "*p"]) -> Float[Array, "*p"]:

@@ -38,7 +38,7 @@ class Free(eqx.Module):
     h: bool = eqx.field(default=True)
     shifts: bool = eqx.field(default=True)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         for name, mask in (("vertices", self.vertices), ("normals", self.normals)):
             if not isinstance(mask, bool) and (
                 not isinstance(mask, np.ndarray) or mask.dtype != bool or mask.ndim != 1

@@ -43,7 +43,7 @@ class SurfaceAtLevel:
     levels: int
     posterior: Callable[[], Posterior]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _ = self.topology  # raises where there is none
 
     @functools.cached_property

@@ -58,9 +58,9 @@ class Measures:
         self.parts: tuple[Part, ...] = find_parts(refined, valves)
         self._whole = js.losses.surface_part(topology)
         self._parts = [js.losses.surface_part(topology, part.faces) for part in self.parts]
-        self.is_closed = refined.is_closed
-        self.cavities = [i for i, part in enumerate(self.parts) if part.is_cavity]
-        self.columns = self._columns()
+        self.is_closed: bool = refined.is_closed
+        self.cavities: list[int] = [i for i, part in enumerate(self.parts) if part.is_cavity]
+        self.columns: list[Column] = self._columns()
 
     @property
     def volumes(self) -> dict[str, int]:

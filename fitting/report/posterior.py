@@ -19,8 +19,10 @@ from jaxsubdiv.linalg import unit
 
 from ..model.pairing import is_on_boundary
 from ..scan.closest_points import boundary_vertices
+from ..solve.arrowhead import ArrowheadFactor
 from ..solve.derivatives import differentiate_across
 from ..solve.elements import face_corners, slopes_of_rows, times_transposed
+from ..solve.sparse_normal import SparseEquations
 from ..solve.strengths import neighbourhood_mean
 from ..solve.structure import sparse_rows
 from .misfit import misfit_variances
@@ -44,10 +46,10 @@ class Posterior:
     """The surfaces that the scan and the priors leave probable: a Gaussian about the fit, to first order."""
 
     def __init__(self, fit: Fit):
-        self.fit = fit
-        self.equations = fit.equations()
+        self.fit: Fit = fit
+        self.equations: SparseEquations = fit.equations()
         matrix = self.equations.data.add(self.equations.prior)
-        self.factor = self.equations.factorise(matrix, fit.loose, fit.active)
+        self.factor: ArrowheadFactor = self.equations.factorise(matrix, fit.loose, fit.active)
 
     def uncertainty(self) -> Uncertainty:
         """Standard deviations across the surface, from the blocks of the covariance that its patches need."""

@@ -9,7 +9,7 @@ from typing import final
 
 import numpy as np
 import optimistix as optx
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 import jaxsubdiv as js
 from jaxsubdiv.notices import warn
@@ -72,17 +72,23 @@ class FitResult:
             fit: what was found.
             recipe: the settings, where they are not those of the fit.
         """
-        self.fit = fit
-        self.control, self.scheme, self.surface = fit.y.control, fit.model.scheme_at(fit.y), fit.surface()
-        self.scan, self.start = fit.scan, fit.start
-        self.at, self.distances, self.weights = (
-            fit.look.at,
-            np.asarray(fit.look.distances),
-            np.asarray(fit.look.weights),
-        )
-        self.rms, self.robust_rms, self.noise = fit.rms, fit.robust_rms, float(fit.look.noise)
-        self.result, self.recipe = fit.result, recipe or fit.settings
-        self.likeness, self.shifts, self.slices = fit.likeness, fit.shifts, fit.slices
+        self.fit: Fit = fit
+        self.control: js.Control = fit.y.control
+        self.scheme: js.AbstractScheme = fit.model.scheme_at(fit.y)
+        self.surface: js.RefinedSurface = fit.surface()
+        self.scan: Scan = fit.scan
+        self.start: js.Control = fit.start
+        self.at: js.SurfacePoint = fit.look.at
+        self.distances: Float[np.ndarray, "p"] = np.asarray(fit.look.distances)
+        self.weights: Float[np.ndarray, "p"] = np.asarray(fit.look.weights)
+        self.rms: Float[np.ndarray, "sweeps"] = fit.rms
+        self.robust_rms: Float[np.ndarray, "sweeps"] = fit.robust_rms
+        self.noise: float = float(fit.look.noise)
+        self.result: optx.RESULTS = fit.result
+        self.recipe: Settings = recipe or fit.settings
+        self.likeness: float = fit.likeness
+        self.shifts: Float[np.ndarray, "s 3"] = fit.shifts
+        self.slices: Int[np.ndarray, "s"] = fit.slices
 
     @functools.cached_property
     def posterior(self) -> Posterior:

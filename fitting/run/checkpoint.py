@@ -27,7 +27,7 @@ class Checkpoint:
             path: the file, an .npz; its folder is made when it is first written.
             inputs: all that the run depends on by name, as pytrees of arrays, numbers and words.
         """
-        self.path = Path(path)
+        self.path: Path = Path(path)
         self._marks = marks_of(inputs)
 
     def read(self) -> dict[str, np.ndarray] | None:

@@ -21,12 +21,21 @@ FIT = "fit.npz"
 """What `fitting.load` reads; it is put in place after all other files."""
 LANDMARKS, CARRIED = "landmarks.mrk.json", "landmarks.csv"
 """Landmarks that were carried to the fit, for 3D Slicer and as a table; beside the summary, a table of those of all."""
+TETRAHEDRA, PATCHES = "tetrahedra.vtu", ("patches.vtu", "patches.xml")
 TABLE_OF_SERIES, PAGE_OF_SERIES, NAMES_OF_SERIES = "series.csv", "series.html", "series.json"
 ANIMATION = "series.gif"
 RESULTS = ("control.obj", "surface.ply", "report.json", "fit.html", "recipe.json", "fit.png", FIT)
 """Of a fit without options."""
 _SERIES = (TABLE_OF_SERIES, PAGE_OF_SERIES, NAMES_OF_SERIES, ANIMATION)
-_PLACED = (*SURFACE_FILES, LANDMARKS, CARRIED, *_SERIES, *(name for name in RESULTS if name not in SURFACE_FILES))
+_EXPORTS = (TETRAHEDRA, *PATCHES)
+_PLACED = (
+    *SURFACE_FILES,
+    *_EXPORTS,
+    LANDMARKS,
+    CARRIED,
+    *_SERIES,
+    *(name for name in RESULTS if name not in SURFACE_FILES),
+)
 _UNFINISHED = ".unfinished-"  # the folders of `jaxsubdiv.files.replace_file` and of `fill_folder`
 _OURS = {*_PLACED, CHECKPOINT, CHECKPOINT_START, SUMMARY}
 

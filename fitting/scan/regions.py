@@ -31,7 +31,7 @@ class RegionMatch(eqx.Module):
     faces: js.Regions
     groups: tuple[tuple[str, tuple[str, ...]], ...] = eqx.field(static=True)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         known = {name for name, n in zip(self.faces.names, self.faces.counts(), strict=True) if n}
         for label, groups in self.groups:
             lost = [name for name in groups if name not in known]

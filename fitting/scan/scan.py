@@ -109,7 +109,7 @@ class Scan(eqx.Module):
     view: Float[np.ndarray, "4 4"] | None = None
     regions: js.Regions | None = eqx.field(converter=_convert_regions, default=None)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[-1] != 3 or len(self.points) == 0:
             raise ScanError(f"a scan needs points of the shape [p, 3], at least one; got {list(self.points.shape)}.")
         for name, values, shape in (

@@ -92,15 +92,17 @@ class OperatorEquations:
     """Linearised rows about one place, as products with their derivatives; `SparseEquations` is the host's."""
 
     def __init__(self, solver: ConjugateGradients, model: Model, y: Variables, held: Held):
-        self._solver, self.model, self._held = solver, model, held
+        self.model: Model = model
+        self._solver, self._held = solver, held
         residual, layout = Residual(model), model.layout
         zero = jnp.zeros(layout.n, y.control.vertices.dtype)
 
         def rows(vector: Float[Array, "n"]) -> dict[str, Float[Array, "_"]]:
             return residual.rows(model.retract(y, layout.split(vector)), held)
 
-        self.values, self._derivative = jax.linearize(rows, zero)
+        self.values: dict[str, Float[Array, "_"]]
         """Rows before they are weighed, by name."""
+        self.values, self._derivative = jax.linearize(rows, zero)
         self._zero = zero
         self._transposed = jax.linear_transpose(self._derivative, zero)
         given = {"distance": held.distance_precisions} | held.precisions

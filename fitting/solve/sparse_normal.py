@@ -21,7 +21,7 @@ from ..model.priors.shifts import ShiftPrior
 from ..model.residual import Held, Model, signed_distances
 from ..model.unknowns import Unknowns, Variables
 from .arrowhead import Arrowhead, ArrowheadFactor, factorise_arrowhead, solve_preconditioned
-from .derivatives import differentiate
+from .derivatives import Derivatives, differentiate
 from .elements import (
     are_many,
     distance_matrix,
@@ -58,18 +58,21 @@ class SparseEquations:
     """Linearised rows about one place on the host: what scan and priors say of the unknowns."""
 
     def __init__(self, structure: Structure, model: Model, y: Variables, held: Held):
-        self.structure, self.model, self.y, self.held = structure, model, y, held
+        self.structure: Structure = structure
+        self.model: Model = model
+        self.y: Variables = y
+        self.held: Held = held
         self._bare = bare = model.strip_strengths()
-        self.gradient = np.zeros(model.layout.n)
+        self.gradient: Float[np.ndarray, "n"] = np.zeros(model.layout.n)
         self.values: dict[str, Float[np.ndarray, "m"]] = {}
         """Rows of each prior, before they are weighed."""
         self._row_faces = row_faces(model, held.priors)
-        self.found = differentiate(bare, y, held.priors, structure.elements.seeds)
+        self.found: Derivatives = differentiate(bare, y, held.priors, structure.elements.seeds)
         self._by: dict[str, Float[np.ndarray, "m d"]] = {}
         self._tied_jacobians: dict[str, sp.csr_array] = {}
         self._known: dict[tuple[str, bytes], ArrowheadFactor] = {}
-        self.data = self._add_distances()
-        self.prior = self._add_face_priors()
+        self.data: Arrowhead = self._add_distances()
+        self.prior: Arrowhead = self._add_face_priors()
         for tied in structure.tied:
             self.prior = self.prior.add(self._add_tied(tied))
 

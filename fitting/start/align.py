@@ -1,7 +1,7 @@
 """Alignment: the template moved to where the scan is, by one linear map and a shift. numpy and scipy, no JAX."""
 
 from itertools import permutations, product
-from typing import Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -140,7 +140,7 @@ def align(
     scan: Scan,
     *,
     kind: Kind = "similarity",
-    landmarks: Landmarks | tuple | None = None,
+    landmarks: Landmarks | tuple[Any, ...] | None = None,
     keep: float = 0.6,
     refine: bool = True,
 ) -> Alignment:

@@ -151,7 +151,7 @@ def write(path: Path, contents: Contents, data: VertexData) -> None:
         writer.SetHeader(f"jaxsubdiv {space_words(contents.frame)}".strip())
     writer.SetInputData(polydata)
     writer.SetFileName(str(path))
-    done, messages = _watch(writer.Write)
+    done, messages = watch(writer.Write)
     if not done or messages:
         raise OSError(f"{path.name}: VTK could not write the file: {messages or 'it gives no reason'}")
 
@@ -278,7 +278,7 @@ def _check_whole(cursor: _Cursor, values: Shaped[np.ndarray, "n"]) -> Int[np.nda
     return indices
 
 
-def _watch(act: Any) -> tuple[Any, str]:
+def watch(act: Any) -> tuple[Any, str]:
     """What `act` returns and what VTK says meanwhile, which would otherwise go to the terminal."""
     core = import_extra("vtkmodules.vtkCommonCore", "io", ".vtp and .vtk files")
     window, window_before = core.vtkStringOutputWindow(), core.vtkOutputWindow.GetInstance()

@@ -157,7 +157,7 @@ def quad_patch(
 
 def _places(stage: Stage, size: int, face: Int[np.ndarray, "m"], side: Int[np.ndarray, "m"]) -> Places:
     """The middles of sides of faces, and with side -1 the middles of quads."""
-    uv, n_children = _corner_uv(size, stage.level), 4**stage.level
+    uv, n_children = corner_uv(size, stage.level), 4**stage.level
     control, child = np.divmod(face, n_children)
     blocks = stage.faces[size].reshape(-1, n_children, size)
     ahead = np.where(side < 0, 2, (side + 1) % size)
@@ -173,7 +173,7 @@ def _control_corners(blocks: Int[np.ndarray, "f n k"], size: int, level: int) ->
     return blocks[:, 4 ** (level - 1) * np.arange(size), 0]
 
 
-def _corner_uv(size: int, level: int) -> Int[np.ndarray, "n k 2"]:
+def corner_uv(size: int, level: int) -> Int[np.ndarray, "n k 2"]:
     """Corners of the descendants of one face, in its own coordinates times `2**level`."""
     uv = np.array([[(0, 0), (1, 0), (1, 1), (0, 1)] if size == 4 else [(0, 0), (1, 0), (0, 1)]])
     for _ in range(level):

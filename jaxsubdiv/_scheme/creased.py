@@ -88,7 +88,7 @@ class AbstractCreasedScheme(AbstractPrimalScheme):
     interpolates: ClassVar[bool] = False
     takes_creases: ClassVar[bool] = True
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         check_option("boundary", self.boundary, ("edge-and-corner", "edge-only"))
 
     @abstractmethod

@@ -65,7 +65,7 @@ class Interpolating(AbstractPointNormalScheme):
     boundary: Boundary = eqx.field(static=True, default="fan")
     order: ClassVar[int] = 4
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         check_option("twist", self.twist, get_args(Twist))
         check_option("weights", self.weights, get_args(Weights))
         check_option("old_normals", self.old_normals, get_args(OldNormals))

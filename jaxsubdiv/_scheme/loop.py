@@ -40,7 +40,7 @@ class Loop(AbstractCreasedScheme):
     takes: ClassVar[tuple[int, ...]] = (3,)
     order: ClassVar[int] = 2
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         check_option("variant", self.variant, get_args(Variant))
 
     def _beta(self, stage: Stage, sides: Sides) -> tuple[Float[np.ndarray, "v"], Float[np.ndarray, "v"]]:

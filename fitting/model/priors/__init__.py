@@ -91,7 +91,7 @@ class Priors(eqx.Module):
     shape: ShapeModes | None = eqx.field(converter=ShapeModes.of, default=None)
     thickness: Float[Array, ""] | None = eqx.field(converter=_if_given, default=None)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         names = ("bend", "stretch", "symmetry", "shift", "frame_change", "likeness", "thickness")
         check_numbers({name: getattr(self, name) for name in names})
         check_numbers({"h of priors": self.h})

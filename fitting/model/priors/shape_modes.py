@@ -48,7 +48,7 @@ class ShapeModes(eqx.Module):
         converter=lambda value: None if value is None else js.strong_float(value), default=None
     )
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         shape = self.modes.shape[:1] + self.mean.shape
         if self.mean.ndim != 2 or self.mean.shape[1] != 3 or self.modes.shape != shape or not self.modes.shape[0]:
             raise ValueError(
