@@ -171,7 +171,7 @@ def test_cross_section_is_that_of_trimesh_with_deviations():
         femur().cross_section((0, 0, 0), (0, 0, 0))
 
 
-def test_distances_and_angles_measure_landmarks():
+def test_distances_and_angles_between_landmarks():
     surface = femur().surface
     rows = [10, 300, 700]
     places = {name: np.asarray(surface.vertices)[row] for name, row in zip("abc", rows, strict=True)}

@@ -136,7 +136,7 @@ def measure_details(posterior: Posterior) -> tuple[Measure, ...]:
         parts += [np.asarray(one) for one in measure_solid(x, triangles)] if is_solid else []
         if symmetry is not None:
             own = vertices[: len(mesh.vertices)]
-            away = np.linalg.norm(symmetry.mirrored(own) - own, axis=1)
+            away = np.linalg.norm(symmetry.mirror(own) - own, axis=1)
             parts.append(np.sqrt(np.mean(away**2, keepdims=True)))
         return np.concatenate(parts)
 

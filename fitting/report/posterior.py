@@ -173,10 +173,11 @@ class Posterior:
     def displace(self, offsets: Float[np.ndarray, "u k"]) -> Float[np.ndarray, "v 3 k"]:
         """How far offsets of the unknowns move every vertex of the surface, to first order, in mm."""
         structure, of_surface = self.equations.structure, np.asarray(self.equations.found.of_surface)
-        n, face = len(of_surface), structure.faces_of_vertices(len(of_surface))
+        n = of_surface.shape[1]
+        face = structure.faces_of_vertices(n)
         moved = np.zeros((n, 3, offsets.shape[1]))
         for rows in np.array_split(np.arange(n), -(-n // _ROWS_AT_ONCE)):
-            along = of_surface[rows].reshape(3 * len(rows), -1)
+            along = of_surface[:, rows].reshape(-1, 3 * len(rows))
             moved[rows] = (self._slopes(along, np.repeat(face[rows], 3)) @ offsets).reshape(len(rows), 3, -1)
         return moved
 
@@ -197,11 +198,11 @@ class Posterior:
         of_surface, found = np.asarray(self.equations.found.of_surface), []
         for rows in np.array_split(np.arange(len(face)), -(-len(face) // _ROWS_AT_ONCE) or 1):
             factors = (weights[rows][:, :, None] * directions[rows][:, None]).astype(of_surface.dtype)
-            along = np.einsum("pcx,pcxs->ps", factors, of_surface[corners[rows]])
+            along = np.einsum("pcx,spcx->sp", factors, of_surface[:, corners[rows]])
             found.append(self._slopes(along, face[rows]))
         return sp.csr_array(sp.vstack(found))
 
-    def _slopes(self, along: Float[np.ndarray, "p s"], face: Int[np.ndarray, "p"]) -> sp.csr_array:
+    def _slopes(self, along: Float[np.ndarray, "s p"], face: Int[np.ndarray, "p"]) -> sp.csr_array:
         """Derivatives by all unknowns, from those along the seeds."""
         elements, n = self.equations.structure.elements, self.fit.model.layout.n
         columns = np.where(elements.columns < elements.n, elements.columns, n)[face]
