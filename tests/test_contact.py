@@ -78,11 +78,21 @@ def test_the_report_names_what_crosses_where_the_fit_starts():
 
 def test_without_ipctk_the_report_says_that_nothing_was_looked_for(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "ipctk", None)
+    with pytest.raises(ImportError, match="fits whose surface must not cross itself need ipctk"):
+        problem().fit(priors=Priors(contact=0.25), max_sweeps=1)
     found = problem().fit(max_sweeps=1)
-    assert found.fit.model.prior("contact") is None
     report = found.report()
     assert report.crossing_triangles is None
     assert dict(report.as_rows())["triangles that cross others"].startswith("not looked for")
+
+
+def test_contacts_without_a_guard_are_refused():
+    p, asked = problem(), Priors(contact=0.25)
+    with pytest.raises(ValueError, match="takes the sparse solver"):
+        p.fit(priors=asked, linear_solver="conjugate gradients")
+    scans = [fitting.Scan(p.points)] * 2
+    with pytest.raises(ValueError, match="a cohort is fitted without"):
+        fitting.fit_cohort(js.Interpolating(), p.topology, p.start, scans, priors=asked)
 
 
 def test_reach_out_of_range_is_refused():
@@ -98,7 +108,7 @@ def flat():
     """The mesh of the problem, so flat that its top and its bottom are near, and the scan as seen from it."""
     p = problem()
     control = js.Control(p.truth.vertices * FLAT, p.truth.normals)
-    model, y = analysed(js.Interpolating(), p.topology, control, no_crossing=True)
+    model, y = analysed(js.Interpolating(), p.topology, control, priors=Priors(contact=0.25))
     guard, surface = make_guard(model, y), model.refine(y)
     assert guard is not None
     scene = make_scene(fitting.Scan(p.points * np.asarray(FLAT)), surface)
@@ -161,7 +171,7 @@ def test_equations_know_the_derivatives_of_contacts_and_couple_both_sides():
 
 def test_a_step_is_shortened_where_it_crosses_and_elsewhere_taken():
     p, (top, below) = problem(), top_and_below()
-    model, y = analysed(js.Interpolating(), p.topology, p.start, no_crossing=True)
+    model, y = analysed(js.Interpolating(), p.topology, p.start, priors=Priors(contact=0.25))
     guard = make_guard(model, y)
     assert guard is not None
     step, asked = np.zeros(model.layout.n), []

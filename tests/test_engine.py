@@ -306,9 +306,8 @@ def derivatives() -> tuple[dict, dict, dict, dict]:
     inputs |= {"regions": RegionMatch(regions, ()), "layers": regions.names}
     upper, lower = (np.isin(np.arange(12), rows) for rows in ((0, 1, 2), (3, 4, 5)))
     slices = np.array([0, 1, -1])
-    inputs["no_crossing"] = True
     inputs["valves"] = ValvePoints(rng.normal(size=(3, 3)), slices, np.zeros(3, int), upper[None], lower)
-    model, y = analysed(scheme, topology, control, priors=Priors(shape=family, symmetry=1.0), **inputs)
+    model, y = analysed(scheme, topology, control, priors=Priors(shape=family, symmetry=1.0, contact=0.25), **inputs)
     assert [prior.name for prior in model.priors] == [kind.name for kind in REGISTER]
     held = model.hold(model.place(y, model.refine(y)), first_strengths(model).values | {"likeness": jnp.asarray(0.5)})
     weights = np.array([[-1, 0.3, 0.3, 0.4], [-0.5, -0.5, 0.2, 0.8]])

@@ -22,7 +22,7 @@ from .progress import Progress
 # Options that a series has no use for, and their values where they are not given.
 _UNUSED = {"tolerance": None, "points": None, "boundary": None, "landmarks": None, "carry": None, "mirror": False}
 _UNUSED |= {"surface_tolerance": None, "tetrahedra": None, "patches": None}
-_UNUSED |= {"symmetry": None, "prior": None, "template_out": None, "may_cross": False}
+_UNUSED |= {"symmetry": None, "prior": None, "template_out": None, "no_crossing": False}
 
 
 def fit_frames(scans: list[Source], options: argparse.Namespace, recipe: Recipe) -> int:

@@ -19,6 +19,8 @@ from ..run.surface_files import FORMATS
 from ..scan.example import Example
 from ..start.parts import PartKind
 
+_CONTACT = 0.25  # `Priors.contact` of --no-crossing
+
 
 def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
@@ -81,9 +83,9 @@ def make_parser() -> argparse.ArgumentParser:
         help="of the template's own shape, expected of the fit; default: found. 0 where it was made from this scan",
     )
     add(
-        "--may-cross",
+        "--no-crossing",
         action="store_true",
-        help="let the surface pass through itself; default: it does not where the extra `contact` is installed",
+        help="do not let the surface pass through itself; takes longer, and the extra `contact`",
     )
     add("--boundary", metavar="FILE", help="points of the curve that the open surface ends at; `scan`: the scan's rim")
     add("--tolerance", type=float, metavar="MM", help="split the control mesh until the surface is this near the scan")
@@ -210,8 +212,8 @@ def make_recipe(options: argparse.Namespace) -> Recipe:
     if options.mirror:
         given["mirror"] = True
     asked = {name: getattr(options, name) for name in ("symmetry", "likeness") if getattr(options, name) is not None}
-    if options.may_cross:
-        asked["contact"] = 0.0
+    if options.no_crossing:
+        asked["contact"] = _CONTACT
     if options.prior is not None:
         asked["shape"] = load_cohort(options.prior)
     if asked:

@@ -97,7 +97,7 @@ def save_fit(
     arrays["frame"] = fit.scan.frame
     arrays |= _arrays_of_regions(fit.scan.regions, fit.regions)
     inputs = fit.inputs
-    arrays["alike"], arrays["no_crossing"] = inputs.get("alike"), bool(inputs.get("no_crossing"))
+    arrays["alike"] = inputs.get("alike")
     arrays["layers"] = json.dumps(inputs["layers"]) if inputs.get("layers") else None
     arrays["marks"] = None if marks is None else json.dumps(marks)
     if inputs.get("landmarks") is not None:
@@ -256,7 +256,6 @@ def _restore(arrays: dict[str, np.ndarray]) -> Fit:
     scan = Scan(**of_points, frame=_frame_of(arrays), regions=_regions_of(arrays, "scan"))
     inputs: dict[str, Any] = {"alike": arrays.get("alike"), "regions": _match_of(arrays, mesh.n_faces)}
     inputs["layers"] = tuple(json.loads(str(arrays["layers"]))) if "layers" in arrays else ()
-    inputs["no_crossing"] = bool(arrays.get("no_crossing", False))  # fits of before let surfaces cross
     if "anchor_points" in arrays:
         inputs["landmarks"] = Anchors(*(put_on_device(f"anchor_{name}") for name in Anchors._fields))
     if "symmetry_partner" in arrays:

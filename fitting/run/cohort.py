@@ -120,6 +120,10 @@ def fit_cohort(
     check_numbers({"max_sweeps": max_sweeps, "tolerance": tolerance, "landmark_deviation": landmark_deviation})
     check_numbers({"at_once": at_once})
     free, priors, loss, say = free or Free(), priors or Priors(), loss or geman_mcclure(), on_stage or (lambda _: None)
+    if float(priors.contact) > 0:
+        raise ValueError(
+            "a cohort is fitted without `Priors.contact`: its surfaces may cross themselves. Leave it out."
+        )
     of_each = _give_each(controls, scans, landmarks, boundary, regions)
     check_one = partial(_check, scheme, topology, free=free, deviation=landmark_deviation, sound={})
     given, inputs, named, failed = [], [], [], {}

@@ -34,7 +34,7 @@ from ..report.result import FitResult
 from ..scan.landmarks import Landmarks
 from ..scan.regions import RegionMatch
 from ..scan.scan import Scan, ScanError
-from ..solve.collision_free import can_find_crossings, make_guard
+from ..solve.collision_free import make_guard
 from ..solve.conjugate_gradients import ConjugateGradients
 from ..solve.pilot import FromPilot
 from ..solve.sparse_normal import SparseNormal
@@ -140,6 +140,7 @@ def fit(
         UserWarning: the start is so far off that the fit will hardly find its way; or faces of the control mesh lie
             upside down on their neighbours, which the fit turns back at its start, as far as it can.
         ScanError: the sizes of scan and control mesh differ as by a wrong unit, or there are too few points.
+        ImportError: the priors ask for no contact, and ipctk, of the extra `contact`, is not installed.
         ValueError: a number is out of its range; the topology has no levels, or does not fit the control; the control
             mesh has no symmetry, though the priors ask for it; the checkpoint is of another fit.
         RuntimeError: with `throw`, the fit did not converge or met values that are not finite.
@@ -163,7 +164,6 @@ def fit(
     kept = None if checkpoint is None else Checkpoint(Path(checkpoint) / CHECKPOINT, given | settings)
     inputs = gather_inputs(scheme, topology, control, scan, free, landmarks, landmark_deviation, boundary)
     inputs |= {"symmetry": symmetry, "alike": alike, "regions": regions, "layers": layers}
-    inputs["no_crossing"] = choose_solver(linear_solver) == "sparse" and can_find_crossings()
     model, y = analyse(scheme, topology, control, free, priors, inputs)
     scene = make_scene(scan, model.refine(y), inputs["slices"], choose_faces(regions, model, y, scan))
     solver = make_solver(model, y, scene, linear_solver, loss, tolerance, max_sweeps)
@@ -239,11 +239,14 @@ def make_solver(
     strengths: FromScan | FromPilot | None = None,
 ) -> Sweeps:
     """The solver of a fit, whose strengths by default follow from the scan."""
-    guard = None
-    if choose_solver(linear_solver) == "sparse":
-        guard = make_guard(model, y)
+    if linear_solver is None:
+        linear_solver = "sparse" if jax.default_backend() == "cpu" else "conjugate gradients"
+    guard = make_guard(model, y)
+    if linear_solver == "sparse":
         held, _ = hold_priors(model, y, model.refine(y), first_strengths(model).values, scene)
         solver = SparseNormal(find_structure(model, y, held))
+    elif guard is not None:
+        raise ValueError('`Priors.contact` takes the sparse solver: say linear_solver="sparse", or leave it out.')
     else:
         eps = float(jnp.finfo(y.control.vertices.dtype).eps)
         solver = ConjugateGradients(max(_TIGHT, _ROUNDING * eps), _MOST_STEPS)
@@ -256,11 +259,6 @@ def make_solver(
         folds=Folds(model.topology),
         guard=guard,
     )
-
-
-def choose_solver(linear_solver: LinearSolver | None) -> LinearSolver:
-    """The linear solver of a fit; by default "sparse" on the CPU."""
-    return linear_solver or ("sparse" if jax.default_backend() == "cpu" else "conjugate gradients")
 
 
 def gather_inputs(

@@ -116,6 +116,10 @@ def fit_series(
     names = [f"frame {k}" for k in range(len(scans))] if names is None else list(names)
     _check_frames(scans, names)
     free, priors, loss = free or Free(), priors or Priors(), loss or geman_mcclure()
+    if float(priors.contact) > 0:
+        raise ValueError(
+            "a series is fitted without `Priors.contact`: its surfaces may cross themselves. Leave it out."
+        )
     if priors.shape is not None or np.isfinite(priors.symmetry):
         raise ValueError("a series is fitted without `Priors.shape` and `Priors.symmetry`: leave them out.")
     valves = find_valves(mesh, valves)

@@ -1,6 +1,5 @@
 """Steps that do not take a surface through itself, and the places where it comes near itself. numpy and ipctk."""
 
-import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -9,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 import jaxsubdiv as js
+from jaxsubdiv.extras import import_extra
 
 from ..model.pairing import Look
 from ..model.priors.contact import ContactPrior, Contacts, no_contacts
@@ -26,16 +26,8 @@ _LEAST_GAP = 0.02  # of the reach: standard deviation of nearer contacts
 _PARALLEL = 1e-3  # squared sine between edges: their places are not unique, and their ends are contacts too
 
 
-def can_find_crossings() -> bool:
-    """Whether ipctk, of the extra `contact`, is installed."""
-    return _ipctk() is not None
-
-
 def _ipctk() -> Any:
-    try:
-        return importlib.import_module("ipctk")
-    except ImportError:
-        return None
+    return import_extra("ipctk", "contact", "fits whose surface must not cross itself")
 
 
 class CrossingGuard:
@@ -109,7 +101,7 @@ class CrossingGuard:
         left_alone, near = self._around(before), None
         share, whole = np.ones(layout.n_vertices), 1.0
         for k in range(_MOST_TRIES):
-            own = layout.of_vertices(share)
+            own = layout.repeat_per_unknown(share)
             taken = whole * step * np.concatenate([own, np.ones(layout.n - layout.n_own)])
             surface = refine(taken)
             # Most of what crossed still does: looking there first is soon done.
@@ -247,10 +239,15 @@ def _positions(surface: js.RefinedSurface) -> Float[np.ndarray, "v 3"]:
 
 
 def make_guard(model: Model, y: Variables) -> CrossingGuard | None:
-    """What keeps a fit's surface from passing through itself; None where nothing is to, or ipctk is not installed."""
+    """What keeps a fit's surface from passing through itself; None where nothing is to.
+
+    Raises:
+        ImportError: ipctk, of the extra `contact`, is not installed.
+    """
     prior = model.prior("contact")
-    if not isinstance(prior, ContactPrior) or not can_find_crossings():
+    if not isinstance(prior, ContactPrior):
         return None
+    _ipctk()
     surface = model.refine(y)
     owner = js.control_faces_of(model.scheme, model.topology, surface, y.control)
     return CrossingGuard(model, surface, owner, float(prior.reach))

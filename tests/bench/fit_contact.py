@@ -3,7 +3,7 @@
     pip install -e '.[bench]' && OPENBLAS_NUM_THREADS=1 python tests/bench/fit_contact.py
 
 Every case of `fit_real.py` that is named, the heart's walls with their regions, and a cortex whose scan keeps its
-normals; each is fitted twice by `fitting.fit_scan`, with `Priors(contact=0)` and as it is, after a sweep that compiles.
+normals; each is fitted twice by `fitting.fit_scan`, without and with `Priors(contact=0.25)`, after a sweep to compile.
 Prints a Markdown table, lengths in mm, of pairs "without / with". `crossing` is the triangles that go through others,
 where the fit starts and where it ends; `normals` the angle between the normals of surface and scan, as a mean over the
 points of scans that have faces. What is not there in ../shared/data, or --data, is skipped.

@@ -88,10 +88,10 @@ class Priors(eqx.Module):
         thickness: of how much thicker what lies between two layers is at a control vertex than at the next, in mm; see
             `fit_layers`. None, the default: found from the scan, place by place.
         contact: how near places of the refined surface come before they repel, as a part of the heights of its
-            triangles there; nearer where the scan itself has layers that are. No standard deviation. Unless it is 0, a
-            fit on the host also shortens every step until the surface does not pass through itself where it did not
-            before. It takes the extra `contact`; without that, by conjugate gradients, in cohorts and in series there
-            is neither.
+            triangles there, 0.25 say; nearer where the scan itself has layers that are. No standard deviation. Where it
+            is not 0, `fit` also shortens every step until the surface does not pass through itself where it did not
+            before. That takes the extra `contact` and the sparse solver; cohorts and series refuse it. 0, the default:
+            the surface may cross itself, and the report says where.
 
     Raises:
         ValueError: a standard deviation is not positive, the likeness not from 0 to 1, or `contact` not from 0 to 0.5.
@@ -106,7 +106,7 @@ class Priors(eqx.Module):
     frame_change: Float[Array, ""] | None = eqx.field(converter=_if_given, default=None)
     shape: ShapeModes | None = eqx.field(converter=ShapeModes.of, default=None)
     thickness: Float[Array, ""] | None = eqx.field(converter=_if_given, default=None)
-    contact: Float[Array, ""] = eqx.field(converter=strong_float, default=0.25)
+    contact: Float[Array, ""] = eqx.field(converter=strong_float, default=0.0)
 
     def __check_init__(self) -> None:
         names = ("bend", "stretch", "symmetry", "shift", "frame_change", "likeness", "thickness")

@@ -52,7 +52,7 @@ class ContactPrior(AbstractSurfacePrior):
 
     @classmethod
     def make(cls, priors: Any, start: Start) -> "ContactPrior | None":
-        return cls(priors.contact) if start.inputs.get("no_crossing") and float(priors.contact) > 0 else None
+        return cls(priors.contact) if float(priors.contact) > 0 else None
 
     def hold(self, place: Place, strengths: dict[str, Any]) -> Contacts:
         """None: they are found on the host, see `CrossingGuard.find_contacts`."""
