@@ -167,6 +167,8 @@ def test_scans_of_other_sizes_are_fitted_in_classes_of_their_own(monkeypatch):
     assert [find_size_class(n) for n in (3, 1024, 1025, 1280, 1281)] == [1024, 1024, 1280, 1280, 1600]
     assert sort_into_classes([1500, 900, 1300, 5000]) == [(1600, [1, 0, 2]), (6102, [3])]  # few scans join a class
     assert [size for size, _ in sort_into_classes([900] * 8 + [1300])] == [1024, 1600]
+    chain = [1000, 1900, 3600, 6500, 12000]  # each twice the one before: none is filled up by more than that
+    assert [rows for _, rows in sort_into_classes(chain)] == [[0, 1], [2, 3], [4]]
     monkeypatch.setattr("fitting.run.buckets._FEW", 1)
     points = np.array(js.sample(truths()[2], 1100, jnp.array([1, 1], jnp.uint32)).points)
     points += np.random.default_rng(1).normal(scale=scans.SIGMA, size=points.shape)

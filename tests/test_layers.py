@@ -237,6 +237,8 @@ def test_what_does_not_match_is_refused():
     with pytest.raises(fitting.ScanError, match="the layer 'two' has no `normals` and others have"):
         points = np.eye(3)
         join_scans({"one": fitting.Scan(points, points), "two": fitting.Scan(points)})
+    with pytest.raises(fitting.ScanError, match="the layer 'one' has the frame RAS and the layer 'two' LPS"):
+        join_scans({"one": fitting.Scan(points, frame="RAS"), "two": fitting.Scan(points, frame="LPS")})
     mesh = meshes()["inner"]
     topology = js.build_topology(mesh, js.Interpolating(), 1)
     with pytest.raises(ValueError, match="the layer 'inner' is no region of the control mesh; it has none"):

@@ -45,6 +45,7 @@ def test_faces_tell_the_sides_too():
 
 
 def test_what_has_no_sides_is_refused():
+    assert fitting.choose_outside(fitting.Scan([[0.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]])).n_points == 1
     points, normals, _ = shell()
     with pytest.raises(fitting.ScanError, match="neither: give a mesh, or normals"):
         fitting.choose_outside(fitting.Scan(points))

@@ -64,6 +64,12 @@ def test_a_template_of_scans_that_lie_anywhere_is_symmetric():
     assert stages[0] == "makes a control mesh of scan 0" and stages[-1].startswith("fits all from their mean, round")
 
 
+@pytest.mark.parametrize("option", [{"checkpoint": "folder"}, {"skip_bad": True}])
+def test_options_of_one_cohort_are_refused(option):
+    with pytest.raises(ValueError, match=f"`{next(iter(option))}` is of one cohort"):
+        fitting.make_template(bodies(), **option)
+
+
 def test_a_template_needs_scans():
     with pytest.raises(ValueError, match="two scans or more, and landmarks of all or none; got 1 and none"):
         fitting.make_template(bodies()[:1])

@@ -17,6 +17,8 @@ def check_exports(options: argparse.Namespace) -> None:
     Raises:
         ImportError: one is not; the text names the extra.
     """
+    if options.no_crossing:
+        import_extra("ipctk", "contact", "fits with --no-crossing")
     modules = ["pyvista"] if options.patches is not None else []
     modules += ["pyvista", "pytetwild", "ipctk"] if options.tetrahedra is not None else []
     for module in modules:

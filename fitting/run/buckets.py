@@ -107,12 +107,14 @@ def sort_into_classes(n_points: Sequence[int]) -> list[tuple[int, list[int]]]:
     classes: dict[int, list[int]] = {}
     for i, n in enumerate(n_points):
         classes.setdefault(find_size_class(n), []).append(i)
-    found: list[tuple[int, list[int]]] = []
+    found: list[tuple[int, int, list[int]]] = []  # each with the size that its smallest scans would have alone
     for size, members in sorted(classes.items()):
-        if found and len(found[-1][1]) < _FEW and size <= _MOST_GROWN * found[-1][0]:
-            members = found.pop()[1] + members
-        found.append((size, members))
-    return found
+        least = size
+        if found and len(found[-1][2]) < _FEW and size <= _MOST_GROWN * found[-1][1]:
+            _, least, fewer = found.pop()
+            members = fewer + members
+        found.append((size, least, members))
+    return [(size, members) for size, _, members in found]
 
 
 def fit_in_buckets(

@@ -126,7 +126,7 @@ def fit_cohort(
         )
     of_each = _give_each(controls, scans, landmarks, boundary, regions)
     check_one = partial(_check, scheme, topology, free=free, deviation=landmark_deviation, sound={})
-    given, inputs, named, failed = [], [], [], {}
+    given, inputs, named, numbers, failed = [], [], [], [], {}
     for i, (one, name) in enumerate(zip(of_each, name_subjects(len(scans), names), strict=True)):
         try:
             one, own = check_one(one)
@@ -135,7 +135,8 @@ def fit_cohort(
                 raise ScanError(f"scan {i}: {error}") from error
             failed[name] = str(error)
         else:
-            given, inputs, named = [*given, one], [*inputs, own], [*named, name]
+            given, inputs = [*given, one], [*inputs, own]
+            named, numbers = [*named, name], [*numbers, i]
     if failed:
         words = "; ".join(f"{name}: {reason}" for name, reason in failed.items())
         if not given:
@@ -143,7 +144,7 @@ def fit_cohort(
         warn(f"{len(failed)} of {len(scans)} scans are left out. {words}")
     have = [one.scan.normals is not None for one in given]
     if any(have) and not all(have):
-        which = have.index(False)
+        which = numbers[have.index(False)]
         raise ScanError(f"scan {which} has no normals and others have: give all of them normals, or none.")
     partners = find_partners(symmetry, priors, topology, given[0].control)
     settings = {"free": free, "priors": priors, "loss": loss, "max_sweeps": max_sweeps, "tolerance": tolerance}
@@ -188,7 +189,7 @@ def fit_cohort(
     ends = [_find_ending(model, scene, state) for model, scene, (_, state) in zip(models, scenes, found, strict=True)]
     converged = np.array([bool(end == optx.RESULTS.successful) for end in ends])
     if not converged.all():
-        which = np.flatnonzero(~converged)
+        which = [number for number, rests in zip(numbers, converged, strict=True) if not rests]
         warn(
             f"{len(which)} of {len(given)} fits did not converge, of the scans {name_rows(which)}: see "
             "`Cohort.converged`. Align them better, or give more `max_sweeps`.",

@@ -140,7 +140,7 @@ def fit(
         UserWarning: the start is so far off that the fit will hardly find its way; or faces of the control mesh lie
             upside down on their neighbours, which the fit turns back at its start, as far as it can.
         ScanError: the sizes of scan and control mesh differ as by a wrong unit, or there are too few points.
-        ImportError: the priors ask for no contact, and ipctk, of the extra `contact`, is not installed.
+        ImportError: `Priors.contact` is not 0, and ipctk, of the extra `contact`, is not installed.
         ValueError: a number is out of its range; the topology has no levels, or does not fit the control; the control
             mesh has no symmetry, though the priors ask for it; the checkpoint is of another fit.
         RuntimeError: with `throw`, the fit did not converge or met values that are not finite.
@@ -239,14 +239,15 @@ def make_solver(
     strengths: FromScan | FromPilot | None = None,
 ) -> Sweeps:
     """The solver of a fit, whose strengths by default follow from the scan."""
-    if linear_solver is None:
-        linear_solver = "sparse" if jax.default_backend() == "cpu" else "conjugate gradients"
     guard = make_guard(model, y)
+    if linear_solver is None:
+        on_host = guard is not None or jax.default_backend() == "cpu"
+        linear_solver = "sparse" if on_host else "conjugate gradients"
     if linear_solver == "sparse":
         held, _ = hold_priors(model, y, model.refine(y), first_strengths(model).values, scene)
         solver = SparseNormal(find_structure(model, y, held))
     elif guard is not None:
-        raise ValueError('`Priors.contact` takes the sparse solver: say linear_solver="sparse", or leave it out.')
+        raise ValueError('`Priors.contact` takes the sparse solver: leave `linear_solver` out, or say "sparse".')
     else:
         eps = float(jnp.finfo(y.control.vertices.dtype).eps)
         solver = ConjugateGradients(max(_TIGHT, _ROUNDING * eps), _MOST_STEPS)

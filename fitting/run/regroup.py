@@ -59,11 +59,12 @@ def regroup(
         options: more for `fit_cohort`; they come before the cohort's own.
 
     Raises:
-        ValueError, ScanError: as `fit_cohort` does.
+        ValueError, ScanError: as `fit_cohort` does; or an option is of one cohort alone, as a checkpoint is.
 
     Source: A. Guimond et al., Average brain models: a convergence study, 2000.
     """
     check_numbers({"rounds": rounds})
+    refuse_of_one_cohort(options)
     say = on_stage or (lambda words: None)
     first = cohort.result(0).fit
     told, topology, scheme = first.settings, first.topology, first.settings.scheme
@@ -95,6 +96,13 @@ def regroup(
     faces = {size: np.asarray(rows) for size, rows in topology.control_faces.items()}
     regions = None if first.regions is None else first.regions.faces
     return Template(js.ControlMesh(mean, faces, regions=regions), cohort, np.array(moved), bool(rests))
+
+
+def refuse_of_one_cohort(options: dict[str, Any]) -> None:
+    """Refuse options of `fit_cohort` that several cohorts, one after another, cannot have."""
+    for name in ("checkpoint", "skip_bad"):
+        if options.get(name):
+            raise ValueError(f"`{name}` is of one cohort, and a template takes several: leave it out.")
 
 
 def _mean_shape(cohort: Cohort, symmetry: Symmetry | None) -> Float[np.ndarray, "v 3"]:

@@ -1,8 +1,10 @@
 """A template from many scans that lie anywhere, which the first of them has no more part in than the others."""
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -17,7 +19,7 @@ from ..start.control_mesh import FaceKind, control_mesh
 from ..start.symmetric_mesh import make_symmetric
 from .cohort import fit_cohort
 from .fit_scan import first_control, move_landmarks
-from .regroup import Template, regroup
+from .regroup import Template, refuse_of_one_cohort, regroup
 
 
 def make_template(
@@ -53,6 +55,7 @@ def make_template(
         ValueError: fewer than two scans, or landmarks of more or fewer; or the mesh has no mirror plane.
         ScanError: as `control_mesh`, `align` and `fit_cohort` do.
     """
+    refuse_of_one_cohort(options)
     say = on_stage or (lambda words: None)
     if len(scans) < 2 or (landmarks is not None and len(landmarks) != len(scans)):
         n = "none" if landmarks is None else len(landmarks)
@@ -71,9 +74,7 @@ def make_template(
     say("fits all")
     priors = options.pop("priors", None) or Priors()
     # Made from the first scan, the control mesh has its noise: that is not expected of any.
-    unlike = Priors(
-        **{name: getattr(priors, name) for name in ("bend", "stretch", "h", "symmetry", "shift")}, likeness=0
-    )
+    unlike = dataclasses.replace(priors, likeness=jnp.zeros(()), shape=None)
     own: dict[str, Any] = options | (
         {} if partners is None or not np.isfinite(priors.symmetry) else {"symmetry": partners}
     )

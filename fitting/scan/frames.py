@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 import jaxsubdiv as js
 from jaxsubdiv.closest import AnyArray
+from jaxsubdiv.frames import Frame
 
 from .scan import Scan, ScanError
 
@@ -81,9 +82,10 @@ def place_frames(scans: Sequence[Scan], periodic: bool) -> tuple[Scan, Frames]:
     if any(scan.weights is not None for scan in scans):
         weights = np.concatenate([np.asarray(scan.weights_or_ones()) for scan in scans])
     join_rows("regions", [None if scan.regions is None else scan.regions.rows for scan in scans], names)
+    frame = join_frames([scan.frame for scan in scans], names)
     words = [word for scan in scans if scan.regions is not None for word in scan.regions.words()]
     placed = [rows + offset.astype(rows.dtype) for rows, offset in zip(points, frames.offsets, strict=True)]
-    whole = Scan(np.concatenate(placed), weights=weights, regions=words or None, frame=scans[0].frame, **parts)
+    whole = Scan(np.concatenate(placed), weights=weights, regions=words or None, frame=frame, **parts)
     return whole, frames
 
 
@@ -138,6 +140,18 @@ def check_slices(scans: Sequence[Scan], names: Sequence[str]) -> None:
                     f"{name}: slice {number} lies {off:.3g} mm off the plane that it has in {names[largest]}. A number "
                     "must be the same slice in all frames: number the slices alike, or fit the frames one by one."
                 )
+
+
+def join_frames(frames: Sequence[Frame | None], names: Sequence[str]) -> Frame | None:
+    """The frame of patient coordinates that several scans have alike.
+
+    Raises:
+        ScanError: they differ; the text names two of these.
+    """
+    for frame, name in zip(frames, names, strict=True):
+        if frame != frames[0]:
+            raise ScanError(f"{names[0]} has the frame {frames[0]} and {name} {frame}: bring all into one frame.")
+    return frames[0]
 
 
 def join_rows(what: str, parts: Sequence[Any], names: Sequence[str]) -> np.ndarray | None:

@@ -10,7 +10,7 @@ import numpy as np
 import jaxsubdiv as js
 
 from .closest_points import boundary_vertices
-from .frames import join_rows
+from .frames import join_frames, join_rows
 from .regions import read_groups
 from .scan import Scan, ScanError
 
@@ -99,7 +99,8 @@ def join_scans(scans: Mapping[str, Scan]) -> Scan:
         of_points["weights"] = np.concatenate([np.asarray(part.weights_or_ones()) for part in parts])
     rows = np.repeat(np.arange(len(parts)), [part.n_points for part in parts])
     points = np.concatenate([np.asarray(part.points) for part in parts])
-    return Scan(points, regions=js.Regions(rows, tuple(scans)), frame=parts[0].frame, **of_points)
+    frame = join_frames([part.frame for part in parts], names)
+    return Scan(points, regions=js.Regions(rows, tuple(scans)), frame=frame, **of_points)
 
 
 def part_scan(scan: Scan, layers: LayerLabels | None) -> dict[str, Scan]:

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
+from .closest_points import nearest_rows
 from .scan import Scan, ScanError
 
 _VIEWS, _LEAST_VIEWS = 60, 5  # from all around; from fewer, points inside are seen too, through openings
@@ -26,8 +27,9 @@ def choose_outside(scan: Scan) -> Scan:
     """
     points, normals = np.asarray(scan.points, np.float64), _find_normals(scan)
     some = points if len(points) <= _SAMPLE else points[np.random.default_rng(0).choice(len(points), _SAMPLE, False)]
-    apart = KDTree(points).query(some, k=min(3, len(points)))[0][:, -1]  # one of two nearest may be a repeated point
-    cell = _CELL * max(float(np.median(apart)), 1e-9 * float(np.ptp(points, axis=0).max()))
+    # One of two nearest may be a repeated point.
+    apart = nearest_rows(KDTree(points), some, min(3, len(points)))[0][:, -1]
+    cell = _CELL * max(float(np.median(apart)), 1e-9 * float(np.ptp(points, axis=0).max())) or 1.0  # of a lone point
     seen = np.zeros(len(points), int)
     for view in _spread_views():
         seen += (normals @ view > _LEAST_COSINE) & _find_foremost(points, view, cell)

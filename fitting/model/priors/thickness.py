@@ -56,7 +56,7 @@ class ThicknessPrior(AbstractVertexPrior):
     of_edges: Int[np.ndarray, "e"]
     choice: js.FaceChoice
     deviation: Float[Array | np.ndarray, ""] | None
-    edge: float = eqx.field(static=True)
+    edge: Float[Array | np.ndarray, ""]
     n_faces: int = eqx.field(static=True)
 
     @classmethod
@@ -92,11 +92,11 @@ class ThicknessPrior(AbstractVertexPrior):
         if not len(edges):
             return None
         choice = js.FaceChoice(other.astype(np.int32), of_surface)
-        edge = float(js.edge_length(start.topology, start.control.vertices))
+        edge = np.asarray(js.edge_length(start.topology, start.control.vertices))
         of_places = own, corners, weights.astype(np.float64), edges, of_edges
         return cls(*of_places, choice, priors.thickness, edge, start.topology.n_control_faces)
 
-    def bare(self) -> "ThicknessPrior":
+    def strip_strengths(self) -> "ThicknessPrior":
         return dataclasses.replace(self, deviation=None)
 
     @property
