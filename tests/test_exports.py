@@ -12,6 +12,7 @@ from scans import noise, problem
 import fitting
 import jaxsubdiv as js
 from fitting.__main__ import main as fit
+from jaxsubdiv import _exports, _tetwild
 from jaxsubdiv.__main__ import main as refine
 
 pytestmark = pytest.mark.usefixtures("command_settings")
@@ -54,18 +55,36 @@ def test_tetrahedra_of_surfaces_in_one_another(folder, capsys):
     assert (grid.field_data["bone"], grid.field_data["marrow"]) == ([1], [2])
     of_bone, of_marrow = np.bincount(grid["region"], grid["Volume"])[1:]
     np.testing.assert_allclose([of_bone, of_marrow], [8000 - 512, 512], rtol=0.01)
-    assert run(refine, "tetrahedra", "bone.obj", "out.vtu", "--edge", 8, "--cavity", "hole.obj") == 0
+    assert run(refine, "tetrahedra", "bone.obj", "--edge", 8, "--cavity", "hole.obj", "out.vtu") == 0
     assert "of the surface 7784" in capsys.readouterr().out
     assert run(refine, "tetrahedra", "bone.obj", "bone.obj", "out.vtu") == 2
     assert "two surfaces have the same name" in capsys.readouterr().err
+
+
+def test_options_stand_anywhere_and_a_failure_is_told(folder, capsys, monkeypatch):
+    monkeypatch.setattr(_tetwild, "_PROGRAM", "raise SystemExit('out of luck')")
+    given = ("bone.obj", "--cavity", "hole.obj", "marrow.obj", "--edge", 8, "--cavity", "other.obj", "out.vtu")
+    js.write_mesh("other.obj", js.ControlMesh(meshes.cube()[0] + [7, 0, 0], meshes.cube()[1]))
+    js.write_mesh("marrow.obj", js.ControlMesh(meshes.cube()[0] - [7, 0, 0], meshes.cube()[1]))
+    assert run(refine, "tetrahedra", *given) == 2
+    assert "error: fTetWild ended with status 1 and made no tetrahedra (out of luck)" in capsys.readouterr().err
+
+
+def test_what_cannot_be_written_is_told_before_anything_is_made(folder, capsys, monkeypatch):
+    monkeypatch.setattr(_exports, "read_mesh", None)  # never called
+    for command in ("tetrahedra", "patches"):
+        assert run(refine, command, "bone.obj", "out.stl") == 2
+        assert "go to .vtu files" in capsys.readouterr().err
+        assert run(refine, command, "bone.obj", "lost/out.vtu") == 2
+        assert "the folder does not exist" in capsys.readouterr().err
+    assert run(refine, "patches", "bone.obj", "lost/out.xml") == 2
+    assert "the folder does not exist" in capsys.readouterr().err
 
 
 def test_patches_of_a_control_mesh(folder, capsys):
     assert run(refine, "patches", "bone.obj", "out.vtu", "--scheme", "catmull-clark", "--levels", 2) == 0
     assert "patches  96, of these 72 exact" in capsys.readouterr().out
     assert set(pyvista.read("out.vtu").celltypes) == {77}
-    assert run(refine, "patches", "bone.obj", "out.stl") == 2
-    assert "go to .vtu files" in capsys.readouterr().err
 
 
 def test_a_fit_is_exported(folder, capsys):
