@@ -1,7 +1,9 @@
 """What the commands write for other programs."""
 
+import argparse
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import meshes
 import numpy as np
@@ -12,6 +14,7 @@ from scans import noise, problem
 import fitting
 import jaxsubdiv as js
 from fitting.__main__ import main as fit
+from fitting.command import outputs
 from jaxsubdiv import _exports, _tetwild
 from jaxsubdiv.__main__ import main as refine
 
@@ -87,7 +90,7 @@ def test_patches_of_a_control_mesh(folder, capsys):
     assert set(pyvista.read("out.vtu").celltypes) == {77}
 
 
-def test_a_fit_is_exported(folder, capsys):
+def test_a_fit_is_exported(folder, capsys, monkeypatch):
     p = problem()
     np.savetxt("scan.xyz", p.points + noise(), fmt="%.17g")
     js.write_mesh("control.obj", js.ControlMesh(p.start.vertices, p.mesh.faces, p.start.normals))
@@ -107,6 +110,15 @@ def test_a_fit_is_exported(folder, capsys):
     assert pyvista.read("out/patches.vtu").n_cells == 14 * 4
     assert run(fit, *given, *exports[:2], "--resume") == 2
     assert "another patches, another surface tolerance" in capsys.readouterr().err
+    options = argparse.Namespace(
+        surface="ply", surface_tolerance=None, surface_level=1, tetrahedra=30.0, patches=1, details=False
+    )
+    for error, words in ((RuntimeError("no luck"), "no luck"), (OSError("full"), "full"), (MemoryError(), "memory")):
+        for name in ("fill_with_tetrahedra", "make_patches"):
+            monkeypatch.setattr(js, name, Mock(side_effect=error))
+        assert outputs._write_surface(folder, result, options, None) == ["surface.ply"]
+        out = capsys.readouterr().out
+        assert all(f"note     no {what}: " in out for what in ("tetrahedra", "patches")) and out.count(words) == 2
 
 
 def test_what_cannot_be_exported_is_told_before_the_fit(folder, capsys, monkeypatch):
