@@ -76,10 +76,10 @@ def refined_twice(mesh) -> js.ControlMesh:
     return js.ControlMesh(js.refine_vertices(js.CatmullClark(), topology, mesh.control()), topology.faces)
 
 
-PARTLY_EXACT = {  # mesh, level of the patches, the mesh whose faces these are, creases, how many are exact
+PARTLY_EXACT = {  # mesh, level of the patches, the mesh whose faces these are, creases, count of exact ones
     "cube": (meshes.cube(), 2, refined_twice, None, 72),
     "boundary": (meshes.grid(5, 4, bumpy=0.3), 0, lambda mesh: mesh, None, 6),
-    "crease": (meshes.grid(6, 6, bumpy=0.3), 0, lambda mesh: mesh, js.Creases([(23, 24)]), None),
+    "crease": (meshes.grid(6, 6, bumpy=0.3), 0, lambda mesh: mesh, js.Creases([(23, 24)]), 10),
 }
 
 

@@ -111,7 +111,7 @@ def test_a_fit_is_exported(folder, capsys, monkeypatch):
     assert run(fit, *given, *exports[:2], "--resume") == 2
     assert "another patches, another surface tolerance" in capsys.readouterr().err
     options = argparse.Namespace(
-        surface="ply", surface_tolerance=None, surface_level=1, tetrahedra=30.0, patches=1, details=False
+        surface=["ply"], surface_tolerance=None, surface_level=1, tetrahedra=30.0, patches=1, details=False
     )
     for error, words in ((RuntimeError("no luck"), "no luck"), (OSError("full"), "full"), (MemoryError(), "memory")):
         for name in ("fill_with_tetrahedra", "make_patches"):
