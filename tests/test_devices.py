@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 # In processes of their own: the number of devices is chosen when JAX starts.
 _ONE_OF_TWO = """
@@ -43,6 +44,7 @@ fit_all("one", None) if number == 0 else fit_all("four", jax.local_devices())
 """
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="processes talk by gloo, which jaxlib has on Linux and macOS")
 def test_subjects_are_divided_between_devices_and_processes(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -56,9 +58,12 @@ def test_subjects_are_divided_between_devices_and_processes(tmp_path):
     command = [sys.executable, "-W", "ignore", "-c", _ONE_OF_TWO, str(tmp_path), address]
     how = {"env": environment, "cwd": tmp_path, "stderr": subprocess.PIPE, "text": True}
     processes = [subprocess.Popen([*command, str(k)], **how) for k in range(2)]
-    for process in processes:
-        _, errors = process.communicate(timeout=600)
-        assert process.returncode == 0, errors[-3000:]
+    try:
+        errors = [process.communicate(timeout=600)[1] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()  # one that has ended hears nothing
+    assert all(process.returncode == 0 for process in processes), errors
     found = {name: np.load(tmp_path / f"{name}.npz") for name in ("one", "four", "eight_0", "eight_1")}
     for name in ("four", "eight_0", "eight_1"):
         for key, values in found["one"].items():

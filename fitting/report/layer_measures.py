@@ -28,7 +28,7 @@ class LayerMeasures:
         pairs = list(pairwise(layers.items()))
         gaps = [(a, b, find_gap(surface, one, other)) for (a, one), (b, other) in pairs]
         self._gaps = [gap for *_, gap in gaps if len(gap.vertices)]
-        self.columns = [Column(f"volume {name}", "ml") for name in layers]
+        self.columns: list[Column] = [Column(f"volume {name}", "ml") for name in layers]
         self.columns += [Column(f"volume between {a} and {b}", "ml") for (a, _), (b, _) in pairs]
         self.columns += [Column(f"area {name}", "cm2") for name in layers]
         self.columns += [Column(f"thickness {a} to {b}", "mm") for a, b, gap in gaps if len(gap.vertices)]

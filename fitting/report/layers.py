@@ -31,7 +31,8 @@ class LayersFit:
         Raises:
             ValueError: the fit has no layers.
         """
-        self.result, self.names = result, result.layers
+        self.result: FitResult = result
+        self.names: tuple[str, ...] = result.layers
         if not self.names:
             raise ValueError("the fit has no layers: fit by `fit_layers`, or `fit(..., layers=...)`.")
 

@@ -43,7 +43,8 @@ class CrossingGuard:
             surface: any of the fit's.
             owner: the control face of every face of the surface.
         """
-        self.reach, self._folds = reach, Folds(model.topology)
+        self.reach: float = reach
+        self._folds = Folds(model.topology)
         self._no_quads = jnp.zeros((0, 4), jnp.int32)
         self._triangles = np.asarray(surface.triangles())
         n_triangles = len(surface.faces[3])
