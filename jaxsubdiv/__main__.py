@@ -37,12 +37,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(arguments: Sequence[str] | None) -> int:
     words = sys.argv[1:] if arguments is None else list(arguments)
     command = _COMMANDS.get(words[0]) if words else None
-    options = _parser().parse_args(words) if command is None else command.parser().parse_args(words[1:])
+    options = _parser().parse_args(words) if command is None else command.parser().parse_intermixed_args(words[1:])
     # A file is refined once: twice the digits cost nothing that one would notice.
     jax.config.update("jax_enable_x64", True)
     try:
         return _run(options) if command is None else command.run(options)
-    except (MeshError, OSError, ValueError, ImportError) as error:
+    except (MeshError, OSError, ValueError, ImportError, RuntimeError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
 

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Int
 
 from ._control import Control
 from ._creases import Creases
-from ._io._gismo import write_multipatch
-from ._io._vtu import BEZIER_QUAD, BEZIER_TRIANGLE, write_grid
+from ._io._gismo import check_can_write_xml, write_multipatch
+from ._io._vtu import BEZIER_QUAD, BEZIER_TRIANGLE, check_can_write_vtu, write_grid
 from ._mesh import ControlMesh
 from ._refine import refine_vertices
 from ._scheme.base import AbstractScheme
@@ -103,6 +103,17 @@ def make_patches(
     exact = _find_exact(scheme, coarse, levels)
     quads = patches[4].reshape(-1, 16)  # of Loop, of other degree, there are none
     return BezierPatches(points, patches[3], quads, exact, float(off.max()), float(np.sqrt(np.mean(off**2))))
+
+
+def check_can_write_patches(path: str | os.PathLike[str]) -> None:
+    """See that patches can be written to a file.
+
+    Raises:
+        MeshError: another suffix than .vtu and .xml.
+        FileNotFoundError: the folder is not there.
+        ImportError: pyvista, of the extras `io` and `simulation`, is not installed, for `.vtu`.
+    """
+    _ = check_can_write_xml(path) if Path(path).suffix.lower() == ".xml" else check_can_write_vtu(path)
 
 
 def write_patches(path: str | os.PathLike[str], patches: BezierPatches) -> None:

@@ -5,8 +5,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from ._bezier_patches import make_patches, write_patches
+from ._bezier_patches import check_can_write_patches, make_patches, write_patches
 from ._io import read_mesh
+from ._io._vtu import check_can_write_vtu
 from ._scheme import SCHEMES
 from ._tetrahedra import fill_with_tetrahedra, write_tetrahedra
 
@@ -30,12 +31,19 @@ def _make_tetrahedra_parser() -> argparse.ArgumentParser:
     add("output", metavar="OUT", help="the tetrahedra, .vtu")
     add("--edge", type=float, metavar="MM", help="length of edge to aim at (default: a twentieth of the diagonal)")
     add("--tolerance", type=float, metavar="MM", help="of the boundary (default: a thousandth of the diagonal)")
-    add("--cavity", nargs="+", metavar="SURFACE", default=[], help="surfaces whose inside stays empty")
+    add(
+        "--cavity",
+        action="append",
+        metavar="SURFACE",
+        default=[],
+        help="a surface whose inside stays empty; for several give --cavity again",
+    )
     add("--scale", type=float, default=1.0, help="multiplies the coordinates; 1000 for metres to mm (default: 1)")
     return parser
 
 
 def _fill(options: argparse.Namespace) -> int:
+    check_can_write_vtu(options.output)
     files = [Path(file) for file in (*options.surfaces, *options.cavity)]
     names = [file.stem for file in files]
     if len(set(names)) < len(names):
@@ -65,9 +73,10 @@ def _make_patches_parser() -> argparse.ArgumentParser:
 
 
 def _write_patches(options: argparse.Namespace) -> int:
+    check_can_write_patches(options.output)
     mesh = read_mesh(options.input, scale=options.scale)
     scheme = SCHEMES[options.scheme]()  # pyright: ignore[reportCallIssue]
-    patches = make_patches(scheme, mesh, mesh.control(), options.levels)
+    patches = make_patches(scheme, mesh, mesh.control(weights=scheme.weights), options.levels)
     write_patches(options.output, patches)
     print(patches.summarise())
     print(f"wrote    {options.output}")

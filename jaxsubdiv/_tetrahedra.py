@@ -8,10 +8,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from . import notices
 from ._crossings import find_crossings
+from ._distance import closest_on_mesh
 from ._io import Surface
 from ._io._vtu import TETRAHEDRON, write_grid
 from ._regions import Regions
@@ -73,8 +74,8 @@ def fill_with_tetrahedra(
         cavities: names of surfaces whose inside stays empty.
 
     Raises:
-        ValueError: a surface is open, its faces point inwards, numbers are not finite or positive, or nothing is left
-            inside.
+        ValueError: a surface is open, its faces point inwards, numbers are not finite or positive, a cavity lies in no
+            surface that is filled, or nothing is left inside.
         ImportError: pytetwild or ipctk, of the extra `simulation`, is not installed.
         RuntimeError: fTetWild failed.
 
@@ -97,19 +98,23 @@ def fill_with_tetrahedra(
     diagonal = float(np.linalg.norm(np.ptp(x, axis=0)))
     edge = _check_length("edge", edge, _EDGE * diagonal)
     tolerance = _check_length("tolerance", tolerance, _TOLERANCE * diagonal)
+    nesting = _Nesting(meshes, np.array([mesh.name in cavities for mesh in meshes]))
     before = np.cumsum([0, *(len(mesh.x) for mesh in meshes)])
     rows = [first + mesh.turn(mesh.name in cavities) for first, mesh in zip(before, meshes, strict=False)]
     triangles = np.concatenate(rows)
     _warn_of_crossings(x, triangles)
     points, cells = run_tetwild(x, triangles, edge, tolerance / diagonal)
+    owner = nesting.find_owners(points[cells].mean(axis=1))
+    filled = ~nesting.is_cavity[owner]
+    used, corners = np.unique(cells[filled], return_inverse=True)
+    points, cells, owner = points[used], corners.reshape(-1, 4), owner[filled]
     if not len(cells):
         raise ValueError(
             "nothing is inside of the surfaces: are there parts that point inwards, or is `edge` too long?"
         )
-    solid = [mesh for mesh in meshes if mesh.name not in cavities]
-    regions = _find_regions(solid, points[cells].mean(axis=1))
-    volume = _measure_enclosed_volume(solid) - sum(mesh.volume for mesh in meshes if mesh.name in cavities)
-    quality = measure_tetrahedra(points, cells, regions, x, triangles, volume)
+    row = np.cumsum(~nesting.is_cavity) - 1
+    regions = Regions(row[owner], tuple(mesh.name for mesh in meshes if mesh.name not in cavities))
+    quality = measure_tetrahedra(points, cells, regions, x, triangles, nesting.measure_volume())
     if quality.n_inverted:
         notices.warn(f"{quality.n_inverted} of {len(cells)} tetrahedra are inverted: a calculation on them would fail.")
     return Tetrahedra(points, cells, regions, quality)
@@ -184,23 +189,68 @@ def _count_windings(corners: Float[Array, "t 3 3"], points: Float[Array, "b p 3"
     return jax.lax.map(of_block, points)
 
 
-def _find_regions(solid: Sequence[_Triangles], middles: Float[np.ndarray, "m 3"]) -> Regions:
-    """Of every tetrahedron the smallest surface around its middle."""
-    rows = np.full(len(middles), int(np.argmax([mesh.volume for mesh in solid])))
-    if len(solid) > 1:
-        for i in np.argsort([-mesh.volume for mesh in solid]):
-            rows[solid[i].encloses(middles)] = i
-    return Regions(rows, tuple(mesh.name for mesh in solid))
+class _Nesting:
+    """Which surfaces lie in one another, and which of them stay empty.
 
+    Attributes:
+        meshes: the surfaces.
+        is_cavity: of each whether its inside stays empty.
+        parents: of each the smallest surface around it; -1 where there is none.
 
-def _measure_enclosed_volume(solid: Sequence[_Triangles]) -> float:
-    """Of surfaces that lie in one another or side by side."""
-    alone = [
-        mesh
-        for mesh in solid
-        if not any(other.volume > mesh.volume and other.encloses(mesh.x[:1])[0] for other in solid)
-    ]
-    return sum(mesh.volume for mesh in alone)
+    Raises:
+        ValueError: a cavity lies in no surface that is filled.
+    """
+
+    def __init__(self, meshes: Sequence[_Triangles], is_cavity: Bool[np.ndarray, "k"]):
+        self.meshes, self.is_cavity = meshes, is_cavity
+        self.parents = np.array([self._find_parent(mesh) for mesh in meshes])
+        for mesh, cavity, parent in zip(meshes, is_cavity, self.parents, strict=True):
+            if cavity and (parent < 0 or is_cavity[parent]):
+                around = "no surface" if parent < 0 else f"the cavity '{meshes[parent].name}'"
+                raise ValueError(
+                    f"the cavity '{mesh.name}' lies in {around}. A cavity lies in a surface that is filled: leave it "
+                    "out, or see that all surfaces have the same unit and place."
+                )
+
+    def _find_parent(self, mesh: _Triangles) -> int:
+        some = mesh.x[:: -(-len(mesh.x) // _POINTS_AT_ONCE)]
+        around = [
+            (other.volume, i)
+            for i, other in enumerate(self.meshes)
+            if other.volume > mesh.volume and other.encloses(some).mean() > 0.5
+        ]
+        return min(around)[1] if around else -1
+
+    def find_owners(self, middles: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, "m"]:
+        """Of every tetrahedron that fTetWild keeps the innermost surface around its middle.
+
+        fTetWild keeps what more surfaces than cavities lie around, so in nested surfaces some of a cavity, too. It
+        moves boundaries within the tolerance: a middle that it would not have kept belongs to the nearest surface, and
+        beside a cavity to what lies around that.
+        """
+        if np.sum(~self.is_cavity) == 1:
+            return np.full(len(middles), np.flatnonzero(~self.is_cavity)[0])
+        around = np.stack([mesh.encloses(middles) for mesh in self.meshes])
+        owner = np.full(len(middles), -1)
+        for i in np.argsort([-mesh.volume for mesh in self.meshes]):
+            owner[around[i]] = i
+        balance = np.where(self.is_cavity, -1, 1) @ around
+        moved = (owner < 0) | (self.is_cavity[owner] & (balance <= 0))
+        if moved.any():
+            away = [closest_on_mesh(middles[moved], mesh.x[mesh.triangles])[0] for mesh in self.meshes]
+            nearest = np.argmin(away, axis=0)
+            owner[moved] = np.where(self.is_cavity, self.parents, np.arange(len(self.meshes)))[nearest]
+        return owner
+
+    def measure_volume(self) -> float:
+        """Of what is filled."""
+        filled = np.append(~self.is_cavity, False)  # the last one: outside of all
+        return float(
+            sum(
+                mesh.volume * (int(filled[i]) - int(filled[parent]))
+                for i, (mesh, parent) in enumerate(zip(self.meshes, self.parents, strict=True))
+            )
+        )
 
 
 def _check_length(name: str, value: float | int | None, usual: float) -> float:

@@ -61,16 +61,22 @@ def refine_within(
         mesh_normals, limit, creases: as `build_topology` has them.
 
     Raises:
-        ValueError: the tolerance is not positive, `h` has one value a level, or no level reaches the tolerance before
-            the surface has a quarter of a million faces.
+        ValueError: the tolerance is not positive, `h` has one value a level, the mesh has more than a quarter of a
+            million faces, or no level reaches the tolerance before the surface has so many.
     """
     if not (np.isfinite(tolerance) and tolerance > 0):
         raise ValueError(f"the tolerance must be a positive length in the unit of the mesh; got {tolerance}.")
     if scheme.h is not None and scheme.h.ndim:
         raise ValueError("`h` has one value a level, so that there is no deeper surface to measure. Give one `h`.")
+    most = _MOST_FACES // 4**_DEEPER
+    if mesh.n_faces > most:
+        raise ValueError(
+            f"the mesh has {mesh.n_faces:,} faces, and the deviation from the limit is measured on surfaces of up to "
+            f"{most:,}. Give a level, or a coarser control mesh."
+        )
     largest = np.inf
     for levels in range(MAX_LEVELS - _DEEPER + 1):
-        if mesh.n_faces * 4 ** (levels + _DEEPER) > _MOST_FACES:
+        if mesh.n_faces * 4**levels > most:
             break
         topology = build_topology(mesh, scheme, levels, mesh_normals=mesh_normals, limit=limit, creases=creases)
         surface = refine(scheme, topology, control)
@@ -101,8 +107,9 @@ def prepare_to_print(surface: RefinedSurface) -> RefinedSurface:
         notices.warn(
             f"the surface has {n_open} boundary edges: it is not watertight, and a printer needs a closed one."
         )
-    used = single[np.unique(triangles)]
-    n_merged = len(used) - len(np.unique(used, axis=0))
+    used = np.unique(triangles)
+    n_before, n_after = (len(np.unique(x[used], axis=0)) for x in (np.asarray(surface.vertices), single))
+    n_merged = n_before - n_after  # vertices that lie on one another as given are not rounded together
     if n_merged:
         notices.warn(
             f"{n_merged} vertices coincide with others in single precision: some triangles become lines. Refine less."

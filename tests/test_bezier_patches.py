@@ -14,13 +14,13 @@ pyvista = pytest.importorskip("pyvista")
 UV = np.array([[0.1, 0.2], [0.5, 0.3], [0.0, 0.7], [0.25, 0.5]])
 
 
-def patches_of(scheme, mesh, levels) -> js.BezierPatches:
-    return js.make_patches(scheme, mesh, mesh.control(), levels)
+def patches_of(scheme, mesh, levels, creases=None) -> js.BezierPatches:
+    return js.make_patches(scheme, mesh, mesh.control(), levels, creases=creases)
 
 
-def on_surface(scheme, mesh, size: int, n: int) -> np.ndarray:
+def on_surface(scheme, mesh, size: int, n: int, creases=None) -> np.ndarray:
     """The surface at these places of all control faces of a size, `[n, 4, 3]`, by `evaluate_control`."""
-    topology = js.build_topology(mesh, scheme, 0, limit=scheme.is_linear)
+    topology = js.build_topology(mesh, scheme, 0, limit=scheme.is_linear, creases=creases)
     face = np.repeat(np.arange(n), len(UV)) + (len(mesh.faces[3]) if size == 4 else 0)
     at = js.SurfacePoint(face, np.tile(UV, (n, 1)))
     return np.asarray(js.evaluate_control(scheme, topology, mesh.control(), at).points).reshape(n, len(UV), 3)
@@ -69,6 +69,30 @@ def test_beside_irregular_vertices_patches_come_closer_with_every_level():
     # Every patch shares its sides: a closed surface of quads has two corners, four inner points and four own a patch.
     n_corners, n_sides = 26, 48
     assert len(coarse.points) == n_corners + 2 * n_sides + 4 * len(coarse.quads)
+
+
+def refined_twice(mesh) -> js.ControlMesh:
+    topology = js.build_topology(mesh, js.CatmullClark(), 2)
+    return js.ControlMesh(js.refine_vertices(js.CatmullClark(), topology, mesh.control()), topology.faces)
+
+
+PARTLY_EXACT = {  # mesh, level of the patches, the mesh whose faces these are, creases, count of exact ones
+    "cube": (meshes.cube(), 2, refined_twice, None, 72),
+    "boundary": (meshes.grid(5, 4, bumpy=0.3), 0, lambda mesh: mesh, None, 6),
+    "crease": (meshes.grid(6, 6, bumpy=0.3), 0, lambda mesh: mesh, js.Creases([(23, 24)]), 10),
+}
+
+
+@pytest.mark.parametrize("name", PARTLY_EXACT)
+def test_patches_that_are_told_exact_are_the_surface(name):
+    given, levels, same_faces, creases, n_exact = PARTLY_EXACT[name]
+    mesh, scheme = js.ControlMesh(*given), js.CatmullClark()
+    patches = patches_of(scheme, mesh, levels, creases)
+    own = same_faces(mesh)
+    expected = on_surface(scheme, own, 4, len(own.faces[4]), creases)
+    away = np.abs(weigh_points(4, 3, UV) @ patches.points[patches.quads] - expected).max(axis=(1, 2))
+    assert away[patches.is_exact].max() < 1e-13 < 1e-5 < away[~patches.is_exact].max()
+    assert patches.is_exact.sum() == n_exact
 
 
 def test_the_error_is_the_distance_from_the_surface():

@@ -1,7 +1,9 @@
 """What the commands write for other programs."""
 
+import argparse
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import meshes
 import numpy as np
@@ -12,6 +14,8 @@ from scans import noise, problem
 import fitting
 import jaxsubdiv as js
 from fitting.__main__ import main as fit
+from fitting.command import outputs
+from jaxsubdiv import _exports, _tetwild
 from jaxsubdiv.__main__ import main as refine
 
 pytestmark = pytest.mark.usefixtures("command_settings")
@@ -54,21 +58,39 @@ def test_tetrahedra_of_surfaces_in_one_another(folder, capsys):
     assert (grid.field_data["bone"], grid.field_data["marrow"]) == ([1], [2])
     of_bone, of_marrow = np.bincount(grid["region"], grid["Volume"])[1:]
     np.testing.assert_allclose([of_bone, of_marrow], [8000 - 512, 512], rtol=0.01)
-    assert run(refine, "tetrahedra", "bone.obj", "out.vtu", "--edge", 8, "--cavity", "hole.obj") == 0
+    assert run(refine, "tetrahedra", "bone.obj", "--edge", 8, "--cavity", "hole.obj", "out.vtu") == 0
     assert "of the surface 7784" in capsys.readouterr().out
     assert run(refine, "tetrahedra", "bone.obj", "bone.obj", "out.vtu") == 2
     assert "two surfaces have the same name" in capsys.readouterr().err
+
+
+def test_options_stand_anywhere_and_a_failure_is_told(folder, capsys, monkeypatch):
+    monkeypatch.setattr(_tetwild, "_PROGRAM", "raise SystemExit('out of luck')")
+    given = ("bone.obj", "--cavity", "hole.obj", "marrow.obj", "--edge", 8, "--cavity", "other.obj", "out.vtu")
+    js.write_mesh("other.obj", js.ControlMesh(meshes.cube()[0] + [7, 0, 0], meshes.cube()[1]))
+    js.write_mesh("marrow.obj", js.ControlMesh(meshes.cube()[0] - [7, 0, 0], meshes.cube()[1]))
+    assert run(refine, "tetrahedra", *given) == 2
+    assert "error: fTetWild ended with status 1 and made no tetrahedra (out of luck)" in capsys.readouterr().err
+
+
+def test_what_cannot_be_written_is_told_before_anything_is_made(folder, capsys, monkeypatch):
+    monkeypatch.setattr(_exports, "read_mesh", None)  # never called
+    for command in ("tetrahedra", "patches"):
+        assert run(refine, command, "bone.obj", "out.stl") == 2
+        assert "go to .vtu files" in capsys.readouterr().err
+        assert run(refine, command, "bone.obj", "lost/out.vtu") == 2
+        assert "the folder does not exist" in capsys.readouterr().err
+    assert run(refine, "patches", "bone.obj", "lost/out.xml") == 2
+    assert "the folder does not exist" in capsys.readouterr().err
 
 
 def test_patches_of_a_control_mesh(folder, capsys):
     assert run(refine, "patches", "bone.obj", "out.vtu", "--scheme", "catmull-clark", "--levels", 2) == 0
     assert "patches  96, of these 72 exact" in capsys.readouterr().out
     assert set(pyvista.read("out.vtu").celltypes) == {77}
-    assert run(refine, "patches", "bone.obj", "out.stl") == 2
-    assert "go to .vtu files" in capsys.readouterr().err
 
 
-def test_a_fit_is_exported(folder, capsys):
+def test_a_fit_is_exported(folder, capsys, monkeypatch):
     p = problem()
     np.savetxt("scan.xyz", p.points + noise(), fmt="%.17g")
     js.write_mesh("control.obj", js.ControlMesh(p.start.vertices, p.mesh.faces, p.start.normals))
@@ -88,6 +110,15 @@ def test_a_fit_is_exported(folder, capsys):
     assert pyvista.read("out/patches.vtu").n_cells == 14 * 4
     assert run(fit, *given, *exports[:2], "--resume") == 2
     assert "another patches, another surface tolerance" in capsys.readouterr().err
+    options = argparse.Namespace(
+        surface=["ply"], surface_tolerance=None, surface_level=1, tetrahedra=30.0, patches=1, details=False
+    )
+    for error, words in ((RuntimeError("no luck"), "no luck"), (OSError("full"), "full"), (MemoryError(), "memory")):
+        for name in ("fill_with_tetrahedra", "make_patches"):
+            monkeypatch.setattr(js, name, Mock(side_effect=error))
+        assert outputs._write_surface(folder, result, options, None) == ["surface.ply"]
+        out = capsys.readouterr().out
+        assert all(f"note     no {what}: " in out for what in ("tetrahedra", "patches")) and out.count(words) == 2
 
 
 def test_what_cannot_be_exported_is_told_before_the_fit(folder, capsys, monkeypatch):

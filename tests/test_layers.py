@@ -1,5 +1,6 @@
 """Layers: several surfaces in one fit, what keeps the thickness between them, and how that is measured."""
 
+import argparse
 import functools
 import json
 
@@ -10,6 +11,7 @@ import trimesh
 import fitting
 import jaxsubdiv as js
 from fitting.__main__ import main as fit_command
+from fitting.command.exports import write_exports
 from fitting.image.volume import Volume
 from fitting.run.layers import prepare_layers
 from fitting.scan.layers import join_scans, part_scan, read_layers, stack_meshes, take_layer
@@ -283,6 +285,24 @@ def test_command_fits_layers(tmp_path, capsys):
     (tmp_path / "layers.json").write_text(json.dumps({"inner": "INNER"}))
     assert fit_command([*arguments, "-o", str(tmp_path / "other")]) == 2
     assert "two or more" in capsys.readouterr().err
+
+
+def test_tetrahedra_of_layers_are_a_region_each(tmp_path, monkeypatch):
+    result, given = two_layers().result, []
+
+    def fill(surfaces, edge):
+        given.append(surfaces)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(js, "fill_with_tetrahedra", fill)
+    for levels in (1, 2):
+        options = argparse.Namespace(tetrahedra=3.0, patches=None)
+        assert write_exports(tmp_path, result, result.refine_to(levels), options) == []
+    assert [list(surfaces) for surfaces in given] == 2 * [["inner", "outer"]]
+    assert len(given[0]["inner"].faces[3]) == 80 * 4
+    for name in ("inner", "outer"):
+        np.testing.assert_array_equal(given[1][name].vertices, two_layers().surface(name).vertices)
+        np.testing.assert_array_equal(given[1][name].faces[3], two_layers().surface(name).faces[3])
 
 
 def test_layers_files_are_read(tmp_path):

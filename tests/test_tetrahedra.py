@@ -9,6 +9,7 @@ import trimesh
 
 import jaxsubdiv as js
 from jaxsubdiv import _tetwild
+from jaxsubdiv._tetrahedra import _Nesting, _Triangles
 from jaxsubdiv._tetrahedron_quality import measure_shapes
 
 pytest.importorskip("pytetwild")
@@ -89,6 +90,39 @@ def mesh_volume(mesh: js.ControlMesh) -> float:
     return trimesh.Trimesh(mesh.vertices, mesh.faces[3]).volume
 
 
+def box(half: float, x: float = 0.0) -> js.ControlMesh:
+    vertices, faces = meshes.cube()
+    return js.ControlMesh(half * vertices + [x, 0, 0], faces)
+
+
+@pytest.mark.parametrize(
+    ("cavities", "of_regions"),
+    [
+        (["small"], {"large": 8000 - 1728, "middle": 1728 - 216}),
+        (["middle", "beside"], {"large": 8000 - 1728 - 8, "small": 216}),
+    ],
+)
+def test_cavities_of_nested_surfaces_stay_empty(cavities, of_regions):
+    surfaces = {"large": box(10), "middle": box(6), "small": box(3)}
+    surfaces |= {"beside": box(1, 8)} if "beside" in cavities else {}
+    filled = js.fill_with_tetrahedra(surfaces, edge=8, tolerance=0.05, cavities=cavities)
+    assert filled.regions.names == tuple(of_regions)
+    volumes = measure_shapes(filled.points, filled.cells)[2]
+    np.testing.assert_allclose(np.bincount(filled.regions.rows, volumes), list(of_regions.values()), rtol=0.02)
+    np.testing.assert_allclose(filled.quality.enclosed_volume, sum(of_regions.values()))
+    np.testing.assert_array_equal(np.unique(filled.cells), np.arange(len(filled.points)))
+
+
+def test_tetrahedra_beyond_a_surface_belong_to_the_nearest():
+    surfaces = {"large": box(10), "small": box(1, 30), "hole": box(2), "core": box(1, 6)}
+    closed = [_Triangles(name, surface) for name, surface in surfaces.items()]
+    nesting = _Nesting(closed, np.array([False, False, True, False]))
+    np.testing.assert_array_equal(nesting.parents, [-1, -1, 0, 0])
+    middles = np.array([[31.001, 0, 0], [-10.001, 0, 0], [29.1, 0, 0], [1.999, 0, 0], [6.5, 0, 0], [4, 0, 0]])
+    names = [closed[i].name for i in nesting.find_owners(middles)]
+    assert names == ["small", "large", "small", "large", "core", "large"]
+
+
 def test_a_part_that_points_inwards_is_a_cavity():
     outer, inner = ball(), ball(0.5)
     faces = np.concatenate([outer.faces[3], inner.faces[3][:, ::-1] + len(outer.vertices)])
@@ -111,6 +145,10 @@ def test_surfaces_without_an_inside_are_refused(tmp_path):
         js.fill_with_tetrahedra({"a": mesh}, cavities=["b"])
     with pytest.raises(ValueError, match="A cavity is one of the surfaces"):
         js.fill_with_tetrahedra({"a": mesh}, cavities=["a"])
+    with pytest.raises(ValueError, match="the cavity 'b' lies in no surface"):
+        js.fill_with_tetrahedra({"a": mesh, "b": ball(0.2, 3, 1)}, cavities=["b"])
+    with pytest.raises(ValueError, match="the cavity 'c' lies in the cavity 'b'"):
+        js.fill_with_tetrahedra({"a": mesh, "b": ball(0.5), "c": ball(0.2, 0, 1)}, cavities=["b", "c"])
 
 
 def test_surfaces_that_cross_are_told():

@@ -47,6 +47,13 @@ def test_a_tolerance_that_no_level_reaches_is_refused(monkeypatch):
         js.refine_within(js.Interpolating([1.0, 0.5]), mesh, mesh.control(), 0.1)
 
 
+def test_a_mesh_with_too_many_faces_is_refused(monkeypatch):
+    monkeypatch.setattr(_within_tolerance, "_MOST_FACES", 80)
+    mesh = js.ControlMesh(*meshes.cube())
+    with pytest.raises(ValueError, match=r"the mesh has 6 faces, and .* on surfaces of up to 5"):
+        js.refine_within(js.Interpolating(), mesh, mesh.control(), 0.1)
+
+
 def test_a_print_is_watertight_once_it_is_read(tmp_path):
     vertices, faces = meshes.mixed_closed()
     mesh = js.ControlMesh(vertices / 3 + 1000.0 / 7, faces)
@@ -65,6 +72,9 @@ def test_a_surface_that_no_printer_takes_is_told():
     with pytest.warns(UserWarning, match="has 16 boundary edges: it is not watertight"):
         js.prepare_to_print(surface)
     ball = js.ControlMesh(*meshes.octahedron())
+    split = js.ControlMesh(np.tile(ball.vertices, (2, 1)), np.concatenate([ball.faces[3], ball.faces[3] + 6]))
+    surface = js.refine(js.Interpolating(), js.build_topology(split, js.Interpolating(), 0), split.control())
+    assert len(js.prepare_to_print(surface).vertices) == 12  # twice the same surface: nothing is rounded, or told
     far = js.ControlMesh(ball.vertices * 1e-6 + 1e3, ball.faces, check=False)
     surface = js.refine(js.Interpolating(), js.build_topology(ball, js.Interpolating(), 0), far.control())
     with pytest.warns(UserWarning, match="vertices coincide with others in single precision"):

@@ -3,12 +3,17 @@
 import argparse
 from pathlib import Path
 
+import jax.numpy as jnp
+
 import jaxsubdiv as js
 from jaxsubdiv.extras import import_extra
 
 from ..report.at_level import SurfaceAtLevel
 from ..report.result import FitResult
 from ..run.folder import PATCHES, TETRAHEDRA
+from ..scan.layers import take_faces
+
+_FAILURES = (ValueError, RuntimeError, OSError, MemoryError)
 
 
 def check_exports(options: argparse.Namespace) -> None:
@@ -60,13 +65,13 @@ def write_exports(folder: Path, result: FitResult, at: SurfaceAtLevel, options: 
     if options.tetrahedra is not None:
         try:
             filled = js.fill_with_tetrahedra(
-                at.surface, edge=None if options.tetrahedra is True else options.tetrahedra
+                _take_closed_layers(result, at), edge=None if options.tetrahedra is True else options.tetrahedra
             )
             js.write_tetrahedra(folder / TETRAHEDRA, filled)
             print(filled.summarise())
             written.append(TETRAHEDRA)
-        except (ValueError, RuntimeError) as error:
-            print(f"note     no tetrahedra: {error}")
+        except _FAILURES as error:
+            print(f"note     no tetrahedra: {_explain(error)}")
     if options.patches is not None:
         try:
             _ = result.refine_to(0)
@@ -75,9 +80,32 @@ def write_exports(folder: Path, result: FitResult, at: SurfaceAtLevel, options: 
                 js.write_patches(folder / name, patches)
                 written.append(name)
             print(patches.summarise())
-        except ValueError as error:
-            print(f"note     no patches: {error}")
+        except _FAILURES as error:
+            print(f"note     no patches: {_explain(error)}")
     return written
+
+
+def _take_closed_layers(result: FitResult, at: SurfaceAtLevel) -> js.RefinedSurface | dict[str, js.RefinedSurface]:
+    """The surface of every layer by its name; layers that share vertices are left as one surface, with one inside."""
+    regions, surface = result.control_mesh.regions, at.surface
+    if not result.layers or regions is None:
+        return surface
+    of_faces = regions.rows[js.control_faces_of(result.scheme, at.topology, surface, result.control)]
+    parts = [take_faces(surface.faces, of_faces == regions.names.index(name)) for name in result.layers]
+    if sum(len(vertices) for vertices, _ in parts) > len(surface.vertices):
+        return surface
+    return {
+        name: js.RefinedSurface(
+            surface.vertices[vertices],
+            surface.normals[vertices],
+            {size: jnp.asarray(rows) for size, rows in faces.items()},
+        )
+        for name, (vertices, faces) in zip(result.layers, parts, strict=True)
+    }
+
+
+def _explain(error: Exception) -> str:
+    return str(error) or "it takes more memory than there is"
 
 
 def _make_bare_mesh(result: FitResult) -> js.ControlMesh:

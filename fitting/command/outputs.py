@@ -87,10 +87,10 @@ def _write_surface(folder: Path, result: FitResult, options: argparse.Namespace,
         at = result.refine_to(find_level(result, options))
         values = {"distance_mm": at.distances, "deviation_mm": at.deviations}
         written = write_surface(folder, at.surface, values, options.surface, frame)
-        return written + write_exports(folder, result, at, options)
     except (ValueError, MemoryError) as error:
         print(f"note     no surface: {str(error) or 'it takes more memory than there is'}")
         return []
+    return written + write_exports(folder, result, at, options)
 
 
 def cut_job_slices(job: Job, result: FitResult) -> Sequence[Slice]:

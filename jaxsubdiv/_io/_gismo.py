@@ -1,6 +1,7 @@
 """XML files of G+Smo, the library for isogeometric analysis: geometries of many patches."""
 
 import errno
+import os
 from pathlib import Path
 
 import numpy as np
@@ -20,16 +21,27 @@ _BASIS = (
 _NUMBER, _ALONG, _FORWARD, _AT = np.array([3, 2, 4, 1]), np.array([0, 1, 0, 1]), np.array([1, 1, 0, 0]), [0, 1, 1, 0]
 
 
+def check_can_write_xml(path: str | os.PathLike[str]) -> Path:
+    """The path of a file in a folder that is there.
+
+    Raises:
+        FileNotFoundError: the folder is not.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, "the folder does not exist, create it first", str(path.parent))
+    return path
+
+
 def write_multipatch(path: Path, points: Float[np.ndarray, "q 16 3"], corners: Int[np.ndarray, "q 4"]) -> None:
     """Write bicubic patches, and which sides of them are one.
 
     Args:
         path: the file, which takes the place of another only once it is complete.
-        points: control points of every patch, row by row, in mm.
+        points: control points of every patch, row by row, in the unit of the surface.
         corners: of every patch, by number: patches with two corners in common share a side.
     """
-    if not path.parent.is_dir():
-        raise FileNotFoundError(errno.ENOENT, "the folder does not exist, create it first", str(path.parent))
+    path = check_can_write_xml(path)
     parts = ['<?xml version="1.0" encoding="UTF-8"?>\n<xml>\n']
     for number, rows in enumerate(points.tolist()):
         coefficients = "\n".join("   {!r} {!r} {!r}".format(*row) for row in rows)

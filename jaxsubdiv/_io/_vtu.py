@@ -44,7 +44,7 @@ def write_grid(
 
     Args:
         path: the file, which ends in .vtu.
-        points: in mm.
+        points: in the unit of the surfaces.
         cells: VTK's number of the kind, and the corners of the cells of that kind, kind by kind.
         cell_data: name -> one number a cell, in the order of `cells`.
         numbers: name -> whole number, kept as field data: meshio reads no words there.
