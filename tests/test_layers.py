@@ -308,6 +308,10 @@ def test_command_fits_layers(tmp_path, capsys):
     (tmp_path / "layers.json").write_text(json.dumps({"inner": "INNER"}))
     assert fit_command([*arguments, "-o", str(tmp_path / "other")]) == 2
     assert "two or more" in capsys.readouterr().err
+    for wrong, words in ((("LV/endo", "epi"), "'LV/endo' cannot name a file"), (("Epi", "epi"), "are one on some")):
+        (tmp_path / "layers.json").write_text(json.dumps(dict(zip(wrong, ("INNER", "OUTER"), strict=True))))
+        assert fit_command([*arguments, "-o", str(tmp_path / "other")]) == 2
+        assert words in capsys.readouterr().err
 
 
 def test_layers_files_are_read(tmp_path):

@@ -16,7 +16,7 @@ from ..image.volume import Label
 from ..model.priors.boundary import BoundaryCurve, boundary_of
 from ..run.checkpoint import marks_of
 from ..run.layers import LayeredScan, prepare_layers, scans_of_volume
-from ..run.names import find_scans
+from ..run.names import check_names, find_scans
 from ..run.recipe import Recipe, find_fits, load
 from ..scan.example import example
 from ..scan.landmarks import FramedLandmarks, Landmarks, match_landmarks, read_framed_landmarks, read_landmarks
@@ -135,6 +135,7 @@ def read_inputs(scan: Source | None, options: argparse.Namespace, recipe: Recipe
 def _read_layers(scan: Source, options: argparse.Namespace, recipe: Recipe) -> Job:
     """The layers that a file names, of a table with labels or of a label map."""
     layers, faces = read_layers(options.layers), recipe.faces
+    check_names(list(layers), "layer")
     if is_image(scan.path):
         points = scans_of_volume(read_volume(scan.path, scale=options.scale), layers)
         frame, labels = next(iter(points.values())).frame, None
