@@ -118,6 +118,7 @@ def test_layers_may_go_through_each_other_and_not_through_themselves():
     through = move_outer(top, (0.7, 0.4, -80))
     own = fitting.LayersFit(through)
     expected = np.asarray(own.surface("outer").triangles())[js.find_crossings(own.surface("outer")).triangles]
+    assert through.crossings is not None
     of_all = np.asarray(through.surface.triangles())[through.crossings.triangles]
     assert len(expected) and through.report().crossing_triangles == len(expected)
     np.testing.assert_allclose(
