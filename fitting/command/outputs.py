@@ -85,7 +85,10 @@ def _write_layers(folder: Path, found: LayersFit, options: argparse.Namespace, f
 
 
 def _write_surface(folder: Path, result: FitResult, options: argparse.Namespace, frame: Frame | None) -> list[str]:
-    """The surface's files; where it has no such level, told, none: the fit itself is not lost."""
+    """Write the surface's files, and return their names.
+
+    A level that the surface lacks leaves all of them out with a note, so that the fit itself is not lost.
+    """
     try:
         at = result.refine_to(find_level(result, options))
         values = {"distance_mm": at.distances, "deviation_mm": at.deviations}
