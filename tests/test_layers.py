@@ -1,9 +1,11 @@
 """Layers: several surfaces in one fit, what keeps the thickness between them, and how that is measured."""
 
 import argparse
+import dataclasses
 import functools
 import json
 
+import equinox as eqx
 import numpy as np
 import pytest
 import trimesh
@@ -99,6 +101,32 @@ def test_layers_are_surfaces_of_their_own():
 def test_a_given_strength_is_kept():
     found = fitted(priors=fitting.Priors(thickness=0.01), max_sweeps=6)
     np.testing.assert_allclose(found.result.fit.strengths.values["thickness"], 1e4, rtol=1e-6)
+
+
+def test_layers_may_go_through_each_other_and_not_through_themselves():
+    pytest.importorskip("ipctk")
+    fit = two_layers().result.fit
+    outer = np.arange(len(fit.y.control.vertices)) >= len(meshes()["inner"].vertices)
+
+    def move_outer(rows: np.ndarray, by: tuple[float, float, float]) -> fitting.FitResult:
+        moved = fit.y.control.vertices + rows[:, None] * np.array(by)
+        return fitting.FitResult(dataclasses.replace(fit, y=eqx.tree_at(lambda y: y.control.vertices, fit.y, moved)))
+
+    aside = move_outer(outer, (10, 0.3, 0.2))
+    assert len(js.find_crossings(aside.surface).triangles) > 20
+    assert aside.report().crossing_triangles == 0
+    assert "surface_crosses_itself" not in [one.name for one in aside.warnings]
+    top = outer & (np.asarray(fit.y.control.vertices)[:, 2] > 0.9 * np.asarray(fit.y.control.vertices)[outer, 2].max())
+    through = move_outer(top, (0.7, 0.4, -80))
+    own = fitting.LayersFit(through)
+    expected = np.asarray(own.surface("outer").triangles())[js.find_crossings(own.surface("outer")).triangles]
+    assert through.crossings is not None
+    of_all = np.asarray(through.surface.triangles())[through.crossings.triangles]
+    assert len(expected) and through.report().crossing_triangles == len(expected)
+    np.testing.assert_allclose(
+        np.asarray(through.surface.vertices)[of_all], np.asarray(own.surface("outer").vertices)[expected]
+    )
+    assert "surface_crosses_itself" in [one.name for one in through.warnings]
 
 
 # Thickness and measures
@@ -285,6 +313,10 @@ def test_command_fits_layers(tmp_path, capsys):
     (tmp_path / "layers.json").write_text(json.dumps({"inner": "INNER"}))
     assert fit_command([*arguments, "-o", str(tmp_path / "other")]) == 2
     assert "two or more" in capsys.readouterr().err
+    for wrong, words in ((("LV/endo", "epi"), "'LV/endo' cannot name a file"), (("Epi", "epi"), "are one on some")):
+        (tmp_path / "layers.json").write_text(json.dumps(dict(zip(wrong, ("INNER", "OUTER"), strict=True))))
+        assert fit_command([*arguments, "-o", str(tmp_path / "other")]) == 2
+        assert words in capsys.readouterr().err
 
 
 def test_tetrahedra_of_layers_are_a_region_each(tmp_path, monkeypatch):

@@ -25,7 +25,7 @@ def test_what_is_seen_is_the_outside():
     kept = np.asarray(found.weights) > 1.5
     assert kept.sum() > 0.98 * outside.sum() and np.mean(~kept) < 0.06  # some of the inside, through the opening
     inside = np.asarray(found.points)[~kept]
-    assert (inside[:, 2] < 0).mean() > 0.5 or len(inside) < 50
+    assert len(inside) < 50 and (inside[:, 2] > 0).all()  # a few on top of the block, below the opening
 
 
 def test_faces_tell_the_sides_too():

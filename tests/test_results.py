@@ -189,6 +189,27 @@ def test_files_are_put_in_place_together_with_the_mark_to_the_end(here):
     assert names("out") == ["control.obj"]
 
 
+def test_layers_take_their_places_with_the_fit_and_go_with_it(here):
+    Path("out").mkdir()
+    with fill_folder(Path("out")) as new:
+        (new / "layers").mkdir()
+        for name in ("endo_control.obj", "endo.ply", "endo.surf.gii", "endo_thickness.png"):
+            (new / "layers" / name).touch()
+        assert names("out") == [new.name]
+    Path("out/layers/own.txt").touch()
+    with fill_folder(Path("out")) as new:
+        (new / "layers").mkdir()
+        (new / "layers" / "epi_control.obj").touch()
+    assert names("out/layers") == ["epi_control.obj", "own.txt"]
+    with fill_folder(Path("out")):
+        pass
+    assert names("out/layers") == ["own.txt"]
+    Path("out/layers/own.txt").unlink()
+    with fill_folder(Path("out")):
+        pass
+    assert names("out") == []
+
+
 def test_what_killed_runs_left_goes_and_what_is_somebody_elses_stays(here):
     for left in (".unfinished-killed/fit.npz", ".unfinished-mine/letter.txt", ".unfinished-file", "checkpoint.npz"):
         Path("out", left).parent.mkdir(parents=True, exist_ok=True)

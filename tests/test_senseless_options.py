@@ -7,6 +7,10 @@ from scans import noise, problem
 
 import fitting
 import jaxsubdiv as js
+from fitting.__main__ import main as fit_command
+from fitting.command.inputs import Job, mark_job
+from fitting.command.options import make_parser
+from fitting.run.checkpoint import find_differing
 
 pytestmark = pytest.mark.usefixtures("command_settings")
 
@@ -30,6 +34,38 @@ def test_senseless_shapes_of_a_loss_are_refused_by_name():
         with pytest.raises(ValueError, match="`alpha`: the shape of a loss"):
             fitting.Barron(alpha)
     assert fitting.Barron(-np.inf).alpha == -np.inf
+
+
+@pytest.mark.parametrize(
+    ("mode", "words", "named"),
+    [
+        (["--layers", "x.json"], ["--outside"], "--outside is not of a fit of layers"),
+        (["--layers", "x.json"], ["--control-landmarks", "a.csv"], "--control-landmarks is not of a fit of layers"),
+        (["--layers", "x.json"], ["--label", "all"], "--label is not of a fit of layers"),
+        (["--layers", "x.json"], ["--prior", "fits"], "--prior is not of a fit of layers"),
+        (["--series", "--control", "c.obj"], ["--details"], "--details is not of a series"),
+        (["--template-out", "t.obj"], ["--tetrahedra"], "--tetrahedra is not of a template of scans"),
+        (["--template-out", "t.obj"], ["--patches", "2"], "--patches is not of a template of scans"),
+        (["--template-out", "t.obj"], ["--no-crossing"], "--no-crossing is not of a template of scans"),
+        (["--template-out", "t.obj"], ["--surface", "glb"], "--surface is not of a template of scans"),
+    ],
+)
+def test_options_that_a_mode_passes_over_are_refused_before_anything_is_read(mode, words, named, capsys):
+    assert fit_command(["nowhere.csv", *mode, *words]) == 2
+    assert named in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", [["--mirror"], ["--symmetry", "1"], ["--likeness", "0.5"]])
+def test_options_of_a_template_are_refused_where_layers_have_none(option, tmp_path, capsys):
+    (tmp_path / "layers.json").write_text('{"endo": "A", "epi": "B"}')
+    assert fit_command(["nowhere.csv", "--layers", str(tmp_path / "layers.json"), *option]) == 2
+    assert f"give --control MESH to {option[0]}" in capsys.readouterr().err
+
+
+def test_details_are_among_the_marks_of_a_fit():
+    recipe, job = fitting.Recipe(js.Interpolating()), Job("one", fitting.Scan(np.eye(3)), None, None)
+    plain, detailed = (mark_job(job, recipe, make_parser().parse_args(words)) for words in ([], ["--details"]))
+    assert find_differing(plain, detailed) == ["details"]
 
 
 OPTIONS = {"max_sweeps": -1, "tolerance": np.nan, "landmark_deviation": 0.0}

@@ -31,7 +31,10 @@ def check_exports(options: argparse.Namespace) -> None:
 
 
 def find_level(result: FitResult, options: argparse.Namespace) -> int | None:
-    """The level that the surface is written at: that asked for, or the first within the tolerance; None is the fit's.
+    """Find the level that the surface is written at: `--surface-level`, or the first within `--surface-tolerance`.
+
+    Returns:
+        the level, or None for that of the fit.
 
     Raises:
         ValueError: the tolerance is not reached, or the surface has no other level.
@@ -56,7 +59,9 @@ def find_level(result: FitResult, options: argparse.Namespace) -> int | None:
 
 
 def write_exports(folder: Path, result: FitResult, at: SurfaceAtLevel, options: argparse.Namespace) -> list[str]:
-    """Write what is asked for; where it cannot be made, told, less: the fit itself is not lost.
+    """Write the tetrahedra and patches that the options ask for.
+
+    A file that cannot be made is left out with a note, so that the fit itself is not lost.
 
     Returns:
         the names of the files.

@@ -19,19 +19,11 @@ from .messages import print_regions, print_warnings, report_failure
 from .one import REFUSALS, is_done
 from .progress import Progress
 
-# Options that a series has no use for, and their values where they are not given.
-_UNUSED = {"tolerance": None, "points": None, "boundary": None, "landmarks": None, "carry": None, "mirror": False}
-_UNUSED |= {"surface_tolerance": None, "tetrahedra": None, "patches": None}
-_UNUSED |= {"symmetry": None, "prior": None, "template_out": None, "no_crossing": False}
-
 
 def fit_frames(scans: list[Source], options: argparse.Namespace, recipe: Recipe) -> int:
     """All frames in one fit: exit status 0, 1 for one not to be trusted, 2 for one that failed."""
     folder = Path(options.output or "series")
     try:
-        for name, usual in _UNUSED.items():
-            if getattr(options, name) != usual:
-                raise ValueError(f"--{name.replace('_', '-')} is not of a series: leave it out.")
         with reserve_folder(folder):
             return _fit_and_save(scans, folder, options, recipe)
     except REFUSALS as error:

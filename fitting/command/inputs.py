@@ -16,7 +16,7 @@ from ..image.volume import Label
 from ..model.priors.boundary import BoundaryCurve, boundary_of
 from ..run.checkpoint import marks_of
 from ..run.layers import LayeredScan, prepare_layers, scans_of_volume
-from ..run.names import find_scans
+from ..run.names import check_names, find_scans
 from ..run.recipe import Recipe, find_fits, load
 from ..scan.example import example
 from ..scan.landmarks import FramedLandmarks, Landmarks, match_landmarks, read_framed_landmarks, read_landmarks
@@ -116,9 +116,8 @@ def read_inputs(scan: Source | None, options: argparse.Namespace, recipe: Recipe
         )
     if options.carry is not None:
         carried = read_framed_landmarks(options.carry, scale=options.control_scale, frame=of_mesh)
-    if mesh is None and (options.symmetry is not None or options.likeness is not None):
-        which = "symmetry" if options.symmetry is not None else "likeness"
-        raise ValueError(f"{which} is that of a template: give --control MESH to --{which}.")
+    if mesh is None:
+        _refuse_without_template(options, "symmetry", "likeness")
     regions = None
     if options.regions is not None:
         if mesh is None:
@@ -135,6 +134,9 @@ def read_inputs(scan: Source | None, options: argparse.Namespace, recipe: Recipe
 def _read_layers(scan: Source, options: argparse.Namespace, recipe: Recipe) -> Job:
     """The layers that a file names, of a table with labels or of a label map."""
     layers, faces = read_layers(options.layers), recipe.faces
+    check_names(list(layers), "layer")
+    if options.control is None:
+        _refuse_without_template(options, "symmetry", "likeness", "mirror")
     if is_image(scan.path):
         points = scans_of_volume(read_volume(scan.path, scale=options.scale), layers)
         frame, labels = next(iter(points.values())).frame, None
@@ -147,6 +149,12 @@ def _read_layers(scan: Source, options: argparse.Namespace, recipe: Recipe) -> J
     how = {"kind": recipe.kind, "closed": recipe.closed, "part": recipe.part}
     layered = prepare_layers(points, mesh, labels, faces=faces, **how)
     return Job(scan.title(), layered.scan, layered.mesh, None, layered=layered)
+
+
+def _refuse_without_template(options: argparse.Namespace, *names: str) -> None:
+    for name in names:
+        if getattr(options, name) not in (None, False):
+            raise ValueError(f"{name} is that of a template: give --control MESH to --{name}.")
 
 
 def _read_template(
@@ -192,6 +200,7 @@ def mark_job(job: Job, recipe: Recipe, options: argparse.Namespace) -> dict[str,
     inputs |= {"landmarks": job.landmarks, "boundary": job.boundary}
     inputs |= {} if job.layered is None else {"layers": job.layered.names}
     inputs |= {} if job.carried is None else {"carried landmarks": job.carried}
+    inputs |= {"details": True} if options.details else {}
     if (options.surface, options.surface_level) != (["ply"], None):
         inputs["surface format or level"] = options.surface, options.surface_level
     for name in ("surface_tolerance", "tetrahedra", "patches"):

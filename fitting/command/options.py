@@ -20,6 +20,15 @@ from ..scan.example import Example
 from ..start.parts import PartKind
 
 _CONTACT = 0.25  # `Priors.contact` of --no-crossing
+# What --series, --layers and --template-out have no use for.
+_UNUSED = {
+    "series": "tolerance points boundary landmarks control_landmarks carry mirror surface surface_level "
+    "surface_tolerance tetrahedra patches symmetry prior template_out no_crossing details",
+    "layers": "outside landmarks control_landmarks carry boundary regions label above labels prior",
+    "template_out": "tolerance boundary landmarks control_landmarks regions likeness mirror align part surface "
+    "surface_level surface_tolerance tetrahedra patches details no_crossing resume",
+}
+_MODES = {"series": "a series", "layers": "a fit of layers", "template_out": "a template of scans"}
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -176,7 +185,12 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def check_options(options: argparse.Namespace) -> None:
-    """See that numbers lie in their ranges, and name them as they were typed."""
+    """See that every option is of use and that numbers lie in their ranges, and name them as they were typed.
+
+    Raises:
+        ValueError: an option would be passed over, or is out of its range.
+    """
+    _refuse_unused(options)
     names = {"tolerance_mm": "tolerance", "most_points": "points"}
     names |= {name: name for name in ("levels", "max_sweeps", "faces", "symmetry", "likeness", "h", "surface_level")}
     names |= {name: name for name in ("scale", "control_scale", "surface_tolerance")}
@@ -189,6 +203,16 @@ def check_options(options: argparse.Namespace) -> None:
         raise ValueError("--surface-tolerance finds the level of the surface: leave --surface-level out.")
     if options.carry and os.path.abspath(options.carry) in _landmark_files(options):
         raise ValueError(f"--carry {options.carry} would be replaced by the landmarks of the fit: give another -o OUT.")
+
+
+def _refuse_unused(options: argparse.Namespace) -> None:
+    usual = make_parser().parse_args([])
+    for mode, names in _UNUSED.items():
+        if getattr(options, mode) == getattr(usual, mode):
+            continue
+        for name in names.split():
+            if getattr(options, name) != getattr(usual, name):
+                raise ValueError(f"--{name.replace('_', '-')} is not of {_MODES[mode]}: leave it out.")
 
 
 def _landmark_files(options: argparse.Namespace) -> list[str]:

@@ -17,13 +17,11 @@ from ..report.result import FitResult
 from ..report.saved import save_fit
 from ..run.carry import carry_landmarks
 from ..run.fit_scan import ScanFit
-from ..run.folder import CARRIED, LANDMARKS, fill_folder
+from ..run.folder import CARRIED, LANDMARKS, LAYER_CONTROL, LAYER_THICKNESS, LAYERS, fill_folder
 from ..run.surface_files import write_surface
 from ..scan.landmarks import write_landmarks
 from .exports import find_level, write_exports
 from .inputs import Job
-
-_LAYERS = "layers"
 
 
 def save_outputs(
@@ -32,12 +30,13 @@ def save_outputs(
     """The fit as files, all of them in place of those of an earlier one, or none."""
     result, frame = found.result, job.scan.frame or (job.carried.frame if job.carried is not None else None)
     slices = cut_job_slices(job, result)
-    if result.layers:
-        _write_layers(folder / _LAYERS, LayersFit(result), options, frame)
     with fill_folder(folder) as new:
         js.write_mesh(new / "control.obj", result.control_mesh, frame=frame)
         written = ["control.obj", *_write_surface(new, result, options, frame)]
         written += ["report.json", "fit.html", "fit.npz", "recipe.json"]
+        if result.layers:
+            (new / LAYERS).mkdir()
+            written += _write_layers(new / LAYERS, LayersFit(result), options, frame)
         if job.carried is not None and job.mesh is not None:
             there = carry_landmarks(job.mesh, result, job.carried.positions)
             for name in (LANDMARKS, CARRIED):
@@ -57,10 +56,13 @@ def save_outputs(
     print(f"wrote    {', '.join(written)} in {folder}")
 
 
-def _write_layers(folder: Path, found: LayersFit, options: argparse.Namespace, frame: Frame | None) -> None:
-    """Every layer's control mesh and surface, and what lies between it and the next, as values and as a picture."""
-    folder.mkdir(exist_ok=True)
-    at = found.result.refine_to()
+def _write_layers(folder: Path, found: LayersFit, options: argparse.Namespace, frame: Frame | None) -> list[str]:
+    """Every layer's control mesh and surface, and what lies between it and the next, as values and as a picture.
+
+    Returns:
+        the names of the files, with that of their folder.
+    """
+    at, written = found.result.refine_to(), list[str]()
     for number, name in enumerate(found.names):
         thickness = found.thickness(name)
         of_surface = {
@@ -70,19 +72,23 @@ def _write_layers(folder: Path, found: LayersFit, options: argparse.Namespace, f
             "thickness_deviation_mm": thickness.deviations,
         }
         values = {word: found.take_values(name, numbers) for word, numbers in of_surface.items()}
-        js.write_mesh(folder / f"{name}_control.obj", found.control_mesh(name), frame=frame)
-        written = write_surface(folder, found.surface(name), values, options.surface, frame, name)
+        js.write_mesh(folder / f"{name}{LAYER_CONTROL}", found.control_mesh(name), frame=frame)
+        written.append(f"{name}{LAYER_CONTROL}")
+        written += write_surface(folder, found.surface(name), values, options.surface, frame, name)
         if number + 1 < len(found.names) and (thickness.shares > 0).any():
             try:
-                draw_thickness(found.result.surface, thickness).savefig(folder / f"{name}_thickness.png")
-                written.append(f"{name}_thickness.png")
+                draw_thickness(found.result.surface, thickness).savefig(folder / f"{name}{LAYER_THICKNESS}")
+                written.append(f"{name}{LAYER_THICKNESS}")
             except ImportError as error:
                 print(f"note     no picture: {error}")
-        print(f"wrote    {name}_control.obj, {', '.join(written)} in {folder}")
+    return [f"{folder.name}/{file}" for file in written]
 
 
 def _write_surface(folder: Path, result: FitResult, options: argparse.Namespace, frame: Frame | None) -> list[str]:
-    """The surface's files; where it has no such level, told, none: the fit itself is not lost."""
+    """Write the surface's files, and return their names.
+
+    A level that the surface lacks leaves all of them out with a note, so that the fit itself is not lost.
+    """
     try:
         at = result.refine_to(find_level(result, options))
         values = {"distance_mm": at.distances, "deviation_mm": at.deviations}

@@ -1,5 +1,6 @@
 """What the scan itself says of its noise, and what of it the surface explains: numbers that findings are judged by."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ import jaxsubdiv as js
 
 from ..model.pairing import Scene
 from ..scan.closest_points import nearest_rows
+from ..scan.layers import take_part
 from ..scan.outliers import first_of_each
 from ..start.cloud import are_on_lines, rows_on_surfaces
 from ..start.orient import plane_fits
@@ -118,7 +120,9 @@ class Evidence(NamedTuple):
     covered: Bool[np.ndarray, "v"]
     """Vertices that the scan covers."""
     crossings: js.Crossings | None
-    """Where the surface goes through itself; None where that was not looked for."""
+    """Where the surface goes through itself, of layers each alone; None where that was not looked for."""
+    layers: tuple[Bool[np.ndarray, "f"], ...]
+    """The faces of each layer; none of other fits."""
 
 
 def rests_far_off(scene: Scene, noise: float, edge: float, robust_rms: Float[np.ndarray, "sweeps"]) -> bool:
@@ -147,6 +151,7 @@ def gather_evidence(
     areas: Float[np.ndarray, "v"],
     covered: Bool[np.ndarray, "v"],
     crossings: js.Crossings | None = None,
+    layers: Sequence[Bool[np.ndarray, "f"]] = (),
 ) -> Evidence:
     """All that the checks look at."""
     look, counted = fit.look, _find_counted(fit.scene)
@@ -163,4 +168,29 @@ def gather_evidence(
         areas=areas,
         covered=covered,
         crossings=crossings,
+        layers=tuple(layers),
+    )
+
+
+def find_own_crossings(surface: js.RefinedSurface, layers: Sequence[Bool[np.ndarray, "f"]]) -> js.Crossings:
+    """Where a surface goes through itself; of layers each is looked at alone.
+
+    Layers that touch, as bone and cartilage where there is no cartilage, go through each other, and are not wrong.
+
+    Args:
+        surface: of all layers.
+        layers: the faces of each, triangles first; none where the surface is one.
+
+    Raises:
+        ImportError: ipctk, of the extra `contact`, is not installed.
+    """
+    if not layers:
+        return js.find_crossings(surface)
+    n = len(surface.faces[3])
+    found = [js.find_crossings(take_part(surface, layer)) for layer in layers]
+    rows = [np.flatnonzero(np.append(layer[:n], np.repeat(layer[n:], 2))) for layer in layers]
+    return js.Crossings(
+        np.sort(np.concatenate([own[one.triangles] for own, one in zip(rows, found, strict=True)])),
+        np.concatenate([one.places for one in found]),
+        len(surface.triangles()),
     )

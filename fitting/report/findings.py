@@ -11,7 +11,15 @@ from jaxsubdiv.errors import name_rows
 
 from ..finding import Finding
 from .coverage import unit
-from .evidence import NOISE_OVER_EDGE, NOISE_OVER_OWN, Evidence, are_among_their_own, find_two_walls, rests_far_off
+from .evidence import (
+    NOISE_OVER_EDGE,
+    NOISE_OVER_OWN,
+    Evidence,
+    are_among_their_own,
+    find_own_crossings,
+    find_two_walls,
+    rests_far_off,
+)
 
 # Each limit lies between the fits that are wrong and those that are right of tests/bench/fit_trust.py.
 _UNEXPLAINED_FAR, _FAR, _UNEXPLAINED = 0.03, 0.1, 0.08  # far: in control edges
@@ -156,12 +164,12 @@ def check_jumps(seen: Evidence) -> Finding | None:
 
 
 def check_crossings(seen: Evidence) -> Finding | None:
-    """Whether the surface goes through itself."""
+    """Whether the surface goes through itself; layers may go through each other."""
     found = seen.crossings
     if found is None or not len(found.triangles):
         return None
     fit = seen.fit
-    start = js.find_crossings(js.refine(fit.model.scheme, fit.topology, fit.start)).triangles
+    start = find_own_crossings(js.refine(fit.model.scheme, fit.topology, fit.start), seen.layers).triangles
     since = "The surface did not where the fit started."
     if len(start):
         since = f"Where the fit started {len(start)} did already, rows {name_rows(start)}: mend the control mesh there."

@@ -88,8 +88,9 @@ class Report:
         least_margin: the least `admissible_margin` of the control normals: the surface is smooth above 0.05, and folds
             below -0.2. None where the scheme does not look at normals.
         measures: volume, area and so on, with standard deviations; empty where these were not asked for.
-        crossing_triangles: how many triangles of the surface go through others of it, a quad being two; None where
-            that was not looked for: the extra `contact` is not installed, or the fit is of a series.
+        crossing_triangles: how many triangles of the surface go through others of it, a quad being two; of layers
+            through others of their own layer. None where that was not looked for: the extra `contact` is not
+            installed, or the fit is of a series.
         crossings_at: x, y, z in mm, the middle of the crossings; None where there are none.
         uncertainty_median, uncertainty_95: median and 95th percentile, over the covered area, of the surface's standard
             deviation; None where it was not asked for.

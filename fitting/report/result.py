@@ -20,7 +20,7 @@ from ..model.recipe import Settings
 from ..scan.scan import Scan
 from .at_level import SurfaceAtLevel
 from .coverage import distances_to_scan, weighted_quantile, worst_places
-from .evidence import gather_evidence
+from .evidence import find_own_crossings, gather_evidence
 from .findings import find_what_speaks_against
 from .fit_measures import (
     CrossSection,
@@ -122,7 +122,7 @@ class FitResult:
         """What speaks against the fit, and against where it started; empty where nothing does."""
         areas, to_scan = self._seen_from_the_scan
         return find_what_speaks_against(
-            gather_evidence(self.fit, self.surface, areas, ~np.isnan(to_scan), self.crossings)
+            gather_evidence(self.fit, self.surface, areas, ~np.isnan(to_scan), self.crossings, self._faces_of_layers)
         )
 
     @property
@@ -139,11 +139,12 @@ class FitResult:
     @functools.cached_property
     def crossings(self) -> js.Crossings | None:
         """Where the surface goes through itself; None where that is not looked for: without the extra `contact`, and in
-        series, whose frames lie in each other."""
+        series, whose frames lie in each other. Of layers each is looked at alone: where layers go through each other,
+        as they do in turn where they touch, is not counted."""
         if self.fit.inputs.get("frames") is not None:
             return None
         try:
-            return js.find_crossings(self.surface)
+            return find_own_crossings(self.surface, self._faces_of_layers)
         except ImportError:
             return None
 
@@ -213,6 +214,10 @@ class FitResult:
     def layers(self) -> tuple[str, ...]:
         """Names of the regions that were fitted as layers, from the inside out; none of other fits."""
         return self.fit.inputs.get("layers") or ()
+
+    @functools.cached_property
+    def _faces_of_layers(self) -> tuple[Bool[np.ndarray, "f"], ...]:
+        return tuple(self.find_faces(name) for name in self.layers)
 
     def find_faces(self, region: str) -> Bool[np.ndarray, "f"]:
         """Which faces of the refined surface lie in a region of the control mesh, triangles first.

@@ -26,6 +26,8 @@ TABLE_OF_SERIES, PAGE_OF_SERIES, NAMES_OF_SERIES = "series.csv", "series.html", 
 ANIMATION = "series.gif"
 FRAMES = "frames"
 """The folder in that of a series with the files of every frame."""
+LAYERS, LAYER_CONTROL, LAYER_THICKNESS = "layers", "_control.obj", "_thickness.png"
+"""The folder in that of a layered fit with the files of every layer, and how the names of two of these files end."""
 RESULTS = ("control.obj", "surface.ply", "report.json", "fit.html", "recipe.json", "fit.png", FIT)
 """Of a fit without options."""
 _SERIES = (TABLE_OF_SERIES, PAGE_OF_SERIES, NAMES_OF_SERIES, ANIMATION)
@@ -96,7 +98,8 @@ def _clean(folder: Path) -> None:
     """Remove what a killed run was writing; files of other names are somebody's own."""
     for left in folder.glob(f"{_UNFINISHED}*/"):
         with suppress(OSError):
-            shutil.rmtree(left / FRAMES, ignore_errors=True)
+            for inner in (FRAMES, LAYERS):
+                shutil.rmtree(left / inner, ignore_errors=True)
             for name in _OURS:
                 (left / name).unlink(missing_ok=True)
             left.rmdir()
@@ -109,6 +112,17 @@ def is_unfinished(folder: Path) -> bool:
     return (folder / CHECKPOINT_START).exists()
 
 
+def _remove_layers(folder: Path) -> None:
+    """Remove the files of an earlier fit's layers, and the folder where nothing else lies in it."""
+    for control in folder.glob(f"*{LAYER_CONTROL}"):
+        name = control.name.removesuffix(LAYER_CONTROL)
+        of_surface = (file.replace("surface", name, 1) for file in SURFACE_FILES)
+        for file in (*of_surface, f"{name}{LAYER_THICKNESS}", control.name):
+            (folder / file).unlink(missing_ok=True)
+    with suppress(OSError):
+        folder.rmdir()
+
+
 @contextmanager
 def fill_folder(folder: Path) -> Iterator[Path]:
     """A folder to write the files of a fit to; they take their places together once the block is left without an error.
@@ -119,10 +133,12 @@ def fill_folder(folder: Path) -> Iterator[Path]:
     new = Path(tempfile.mkdtemp(prefix=_UNFINISHED, dir=folder))
     try:
         yield new
-        if (new / FRAMES).is_dir():  # file by file: the folder may hold others
-            (folder / FRAMES).mkdir(exist_ok=True)
-            for file in (new / FRAMES).iterdir():
-                os.replace(file, folder / FRAMES / file.name)
+        _remove_layers(folder / LAYERS)
+        for inner in (FRAMES, LAYERS):
+            if (new / inner).is_dir():  # file by file: the folder may hold others
+                (folder / inner).mkdir(exist_ok=True)
+                for file in (new / inner).iterdir():
+                    os.replace(file, folder / inner / file.name)
         for name in _PLACED:
             if (new / name).exists():
                 os.replace(new / name, folder / name)

@@ -12,6 +12,7 @@ from .folder import CARRIED, SUMMARY, find_results
 
 _SCAN_FILES = {".ply", ".xyz", ".csv", ".txt", ".npz", ".vtp", ".vtk", ".stl", ".obj", ".off", ".gii"}
 _SCAN_FILES |= {".vtu", ".glb", ".pcd", ".pts", ".hsp"}
+_SEPARATORS = '/\\:*?"<>|'  # of folders, and what no file on Windows may have in its name
 _LONGEST = 200  # bytes: file systems take 255, and a file that is being written has a longer name
 
 
@@ -78,6 +79,28 @@ def _choices(scan: Path) -> list[str]:
 def _key(name: str) -> str:
     """What names share that some file system takes for one: capitals, accents in two spellings, dots at the end."""
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold()).rstrip(". ")
+
+
+def check_names(names: Sequence[str], what: str) -> None:
+    """See that files can have these names, in one folder and on any file system.
+
+    Args:
+        names: without an ending.
+        what: they are the names of, as `layer`.
+
+    Raises:
+        ValueError: a name is none of a file, or two are one on some file system; the text has it.
+    """
+    taken = dict[str, str]()
+    for name in names:
+        if _is_bad(name) or any(c in _SEPARATORS or not c.isprintable() for c in name):
+            raise ValueError(
+                f"the {what} {name!r} cannot name a file: leave out {' '.join(_SEPARATORS)}, and take a word of up to "
+                f"{_LONGEST} bytes."
+            )
+        other = taken.setdefault(_key(name), name)
+        if other != name:
+            raise ValueError(f"the names of the {what}s {other!r} and {name!r} are one on some file systems.")
 
 
 def _is_bad(name: str) -> bool:
