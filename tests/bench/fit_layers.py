@@ -36,7 +36,7 @@ def main() -> None:
     n_points = sum(scan.n_points for scan in scans.values())
     seconds = time.perf_counter() - began
     print(f"{len(result.control.vertices):,} control vertices, 40,000 of {n_points:,} points, {seconds:.0f} s")
-    print(f"warnings: {', '.join(finding.name for finding in result.warnings) or 'none'}\n")
+    print(f"warnings: {' '.join(f'{one.name}: {one.text}' for one in result.warnings) or 'none'}\n")
     print_volumes(found, volume)
     print_thickness(found, known, volume)
     if options.picture is not None:
