@@ -6,7 +6,7 @@ from jaxtyping import Array, Float, Int
 from ._control import Control
 from ._scheme.base import AbstractScheme
 from ._surface import RefinedSurface
-from ._topology import Level, Topology
+from ._topology import Topology
 from .half_edges import HalfEdges, half_edges
 
 
@@ -55,7 +55,7 @@ def faces_of_levels(topology: Topology) -> list[dict[int, Int[Array, "_ _"]]]:
     Raises:
         ValueError: the tables are of a linear scheme, or padded.
     """
-    if not all(isinstance(level, Level) for level in topology.levels) or topology.real is not None:
+    if not topology.tells_levels:
         raise ValueError(
             "only tables of points and normals that are not padded tell the faces of their levels: take those of each "
             "level from `build_topology`."

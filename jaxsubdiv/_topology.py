@@ -117,6 +117,11 @@ class Topology(eqx.Module):
         return sum(len(faces) for faces in self.control_faces.values())
 
     @property
+    def tells_levels(self) -> bool:
+        """Whether the tables tell the faces of every level: those of points and normals do, unless they are padded."""
+        return all(isinstance(level, Level) for level in self.levels) and self.real is None
+
+    @property
     def has_seams(self) -> bool:
         """Whether boundary edges are sewn together at some level."""
         return any(isinstance(level, Level) and level.seams is not None for level in self.levels)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import meshes
 import numpy as np
 import pytest
+from scans import analysed
 
 import jaxsubdiv as js
 
@@ -35,6 +36,16 @@ def test_coarse_level_has_the_gradient_of_its_own():
     found = jax.grad(sum_squares)(control.vertices, lambda moved: js.refine_levels(scheme, topology, moved)[1])
     expected = jax.grad(sum_squares)(control.vertices, lambda moved: js.refine(scheme, early, moved))
     np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("scheme", [js.BezierTriangle(), js.Loop(), js.CirclePreserving()])
+def test_rows_of_a_fit_have_a_surface_whatever_the_scheme(scheme):
+    mesh = js.ControlMesh(*meshes.octahedron())
+    topology = js.build_topology(mesh, scheme, 1)
+    model, y = analysed(scheme, topology, mesh.control())
+    place = model.place_of(y)
+    assert (place.before is not None) == topology.tells_levels == isinstance(scheme, js.CirclePreserving)
+    np.testing.assert_allclose(place.surface.vertices, js.refine(scheme, topology, y.control).vertices, atol=1e-14)
 
 
 def test_tables_that_do_not_tell_their_levels_are_refused():

@@ -100,7 +100,7 @@ class Model(eqx.Module):
         """The same with the surface; see `Place.before`."""
         scheme, topology = self.scheme_at(y), self.topology
         keeps_normals = scheme.uses_normals and not scheme.recomputes_normals and not topology.mesh_normals
-        if not keeps_normals or topology.real is not None:
+        if not keeps_normals or not topology.tells_levels:
             return self.place(y, self.refine(y))
         *_, before, surface = js.refine_levels(scheme, topology, y.control)
         return self.place(y, surface)._replace(before=before)
