@@ -86,7 +86,7 @@ def draw_surface(
     Raises:
         ImportError: matplotlib is missing; it comes with the extra `viz`.
     """
-    import_extra("matplotlib", "viz", "pictures")
+    import_extra("matplotlib.cm", "viz", "pictures")
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize, to_rgb
