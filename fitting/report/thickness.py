@@ -7,11 +7,9 @@ from jaxtyping import Bool, Float, Int
 
 import jaxsubdiv as js
 
-from ..scan.closest_points import closest_points
-from ..scan.layers import choose_faces, find_rim, take_part
+from ..scan.layers import find_opposite, take_part
 from .posterior import Posterior
 
-_RIM = 1e-3  # of a face: how near the other layer's rim there is no thickness
 _DRAWS, _DRAWS_AT_ONCE = 512, 64  # a standard deviation of so many is right to 3 %
 
 
@@ -63,26 +61,13 @@ def find_gap(surface: js.RefinedSurface, layer: Bool[np.ndarray, "f"], other: Bo
         surface: of all layers.
         layer, other: the faces of each, triangles first.
     """
-    vertices, rim = np.asarray(surface.vertices, np.float64), find_rim(surface, other)
-    used, others = (_used(surface, of) for of in (layer, other))
-    own = np.setdiff1d(used, others)
-    at = closest_points(surface, vertices[own], js.FaceChoice(np.zeros(len(own), np.int32), other[None]))
-    corners, weights = (np.asarray(part) for part in js.corner_weights(surface, at))
-    there = np.sum(np.where(rim[corners], weights, 0), axis=1) <= 1 - _RIM
-    own, corners, weights = own[there], corners[there], weights[there]
-    directions = np.asarray(js.evaluate(surface, at).normals, np.float64)[there]
-    away = np.sum(weights[..., None] * vertices[corners], axis=1) - vertices[own]
-    directions *= np.where(np.sum(directions * away) < 0, -1.0, 1.0)
-    areas = np.asarray(take_part(surface, layer).vertex_areas(), np.float64)[own]
-    faces = np.asarray(at.face)[there]
-    return Gap(
-        own, corners, weights.astype(np.float64), faces, directions, areas / max(areas.sum(), np.finfo(float).tiny)
-    )
-
-
-def _used(surface: js.RefinedSurface, chosen: Bool[np.ndarray, "f"]) -> Int[np.ndarray, "u"]:
-    """The vertices of some faces."""
-    return np.unique(np.concatenate([rows.ravel() for rows in choose_faces(surface.faces, chosen).values()]))
+    vertices, to = np.asarray(surface.vertices, np.float64), find_opposite(surface, layer, other)
+    directions = np.asarray(js.evaluate(surface, to.at).normals, np.float64)
+    away = np.sum(to.weights[..., None] * vertices[to.corners], axis=1) - vertices[to.vertices]
+    directions = np.where(np.sum(directions * away) < 0, -1.0, 1.0) * directions
+    areas = np.asarray(take_part(surface, layer).vertex_areas(), np.float64)[to.vertices]
+    shares = areas / max(areas.sum(), np.finfo(float).tiny)
+    return Gap(to.vertices, to.corners, to.weights.astype(np.float64), np.asarray(to.at.face), directions, shares)
 
 
 def measure_thickness(

@@ -2,18 +2,19 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
 
 import jaxsubdiv as js
 
-from .closest_points import boundary_vertices
+from .closest_points import boundary_vertices, closest_points
 from .frames import join_frames, join_rows
 from .regions import read_groups
 from .scan import Scan, ScanError
 
+_RIM = 1e-3  # of a face: how near a layer's rim a place counts as where the layer ends
 LayerLabels: TypeAlias = Mapping[str, str | Sequence[str]]
 """Layer, from the inside out -> the label, or labels, of its points."""
 
@@ -77,6 +78,32 @@ def take_part(surface: js.RefinedSurface, chosen: np.ndarray) -> js.RefinedSurfa
     """A surface with some of its faces, and all of its vertices."""
     faces = {size: jnp.asarray(rows) for size, rows in choose_faces(surface.faces, chosen).items()}
     return js.RefinedSurface(surface.vertices, surface.normals, faces)
+
+
+class Opposite(NamedTuple):
+    """The places of one layer that are closest to the vertices of another, as one surface has them."""
+
+    vertices: np.ndarray
+    """Of the one layer; none on the other, nor where that ends."""
+    at: js.SurfacePoint
+    corners: np.ndarray
+    weights: np.ndarray
+    """The place on the other layer, and the vertices that it lies between."""
+
+
+def find_opposite(surface: js.RefinedSurface, layer: np.ndarray, other: np.ndarray) -> Opposite:
+    """The closest places of one layer to the vertices of another.
+
+    Args:
+        surface: of all layers.
+        layer, other: the faces of each, triangles first.
+    """
+    own = np.setdiff1d(take_faces(surface.faces, layer)[0], take_faces(surface.faces, other)[0])
+    choice = js.FaceChoice(np.zeros(len(own), np.int32), other[None])
+    at = closest_points(surface, np.asarray(surface.vertices)[own], choice)
+    corners, weights = (np.asarray(part) for part in js.corner_weights(surface, at))
+    there = np.sum(np.where(find_rim(surface, other)[corners], weights, 0), axis=1) <= 1 - _RIM
+    return Opposite(own[there], js.SurfacePoint(at.face[there], at.uv[there]), corners[there], weights[there])
 
 
 def find_rim(surface: js.RefinedSurface, chosen: np.ndarray) -> np.ndarray:

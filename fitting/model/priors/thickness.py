@@ -11,15 +11,13 @@ from jaxtyping import Array, Float, Int
 import jaxsubdiv as js
 from jaxsubdiv.linalg import dot, take
 
-from ...scan.closest_points import closest_points
-from ...scan.layers import find_rim
+from ...scan.layers import find_opposite
 from ...scan.regions import RegionMatch
 from ..unknowns import AnyArray
 from .base import AbstractVertexPrior, Place, Start, backend
 from .bend import start_place
 
 _FIRST = 0.02  # of a control edge: standard deviation of a difference in the first sweep, where that is to be found
-_RIM = 1e-3  # of a face: how near the other layer's rim there is no thickness
 
 
 class _Held(NamedTuple):
@@ -75,18 +73,11 @@ class ThicknessPrior(AbstractVertexPrior):
         flat = js.RefinedSurface(start.control.vertices, start.control.normals, start.topology.control_faces)
         of_control = np.stack([region == number for number in numbers])
         ends, of_ends = js.control_edges(start.topology)
-        faces = np.concatenate([np.pad(np.asarray(flat.faces[3]), ((0, 0), (0, 1)), "edge"), np.asarray(flat.faces[4])])
         found: list[tuple] = []
         next_ = [(k, k + 1) for k in range(len(layers) - 1)]
         for a, b in next_ + [(b, a) for a, b in next_]:
-            own = np.unique(faces[of_control[a]])
-            to = js.FaceChoice(np.zeros(len(own), np.int32), of_control[b][None])
-            at = closest_points(flat, np.asarray(start.control.vertices)[own], to)
-            corners, weights = (np.asarray(part) for part in js.corner_weights(flat, at))
-            shared = np.isin(own, np.unique(faces[of_control[b]]))  # where the layers meet
-            on_rim = np.sum(np.where(find_rim(flat, of_control[b])[corners], weights, 0), axis=1) > 1 - _RIM
-            there = ~(on_rim | shared)
-            found.append((own[there], np.full(there.sum(), b), corners[there], weights[there]))
+            to = find_opposite(flat, of_control[a], of_control[b])
+            found.append((to.vertices, np.full(len(to.vertices), b), to.corners, to.weights))
         own, other, corners, weights = (np.concatenate(parts) for parts in zip(*found, strict=True))
         edges, of_edges = _neighbours(own, other, ends, of_ends)
         if not len(edges):
